@@ -67,6 +67,7 @@ lint:
 	@$(PYTHON_IN_VENV) -m ruff check .
 	@$(PYTHON_IN_VENV) -m ruff format --check .
 	@$(PYTHON_IN_VENV) -m mypy
+	@$(PYTHON_IN_VENV) tools/english.py
 	@find $(CORE) -name '*.h' -o -name '*.cpp' | xargs .venv/bin/clang-format --dry-run -Werror
 
 # AddressSanitizer and UndefinedBehaviorSanitizer of g++. What Python itself leaks is not told.

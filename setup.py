@@ -270,7 +270,7 @@ setup(
             'image/*.yaml',
             'app/report/page/*',
         ],
-        # The message definitions are read by whoever works on bags without ROS.
+        # The message definitions are also read without ROS, by those who work on bags.
         'msg_tools': ['hmt_msgs/msg/*.msg', 'hmt_msgs/srv/*.srv'],
     },
     data_files=[

@@ -190,7 +190,7 @@ def measure(
     """Counts over all clips, by case and rate.
 
     Raises:
-        ValueError: there are none, or one can not be read.
+        ValueError: none are there, or one can not be read.
     """
     folders, source = find_clips(clips, moving=True, quick=quick)
     if clips is None and not quick:

@@ -1,4 +1,4 @@
-"""A camera in a process of its own: it shows the images of a clip at a rate, whoever keeps up.
+"""A camera in a process of its own: it shows the images of a clip at a fixed rate.
 
     python -m benchmarks.camera FOLDER TRANSPORT RATE IMAGES SUBSCRIBERS [BAG TOPIC]
 

@@ -128,7 +128,7 @@ def find_clips(
         quick: whether, without a folder, one short clip of this repository is enough.
 
     Raises:
-        ValueError: there are none.
+        ValueError: no clip is there.
     """
     if folder is not None:
         return _clips_in(folder, moving), str(folder)
@@ -302,7 +302,7 @@ def read_detections(folder: Path, *, lifted: bool = True) -> Detections:
     """Reads the detector's keypoints of a clip.
 
     Raises:
-        ValueError: there are none, or they can not be read.
+        ValueError: none are there, or they can not be read.
     """
     try:
         content = read_archive(folder / 'keypoints_mediapipe.npz')

@@ -85,7 +85,7 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
     """What `of_clip` finds on the clips, and means over groups of clips.
 
     Raises:
-        ValueError: there are none, or one can not be read.
+        ValueError: none are there, or one can not be read.
     """
     folders = find_clips(clips, quick=quick)[0]
     folders = [

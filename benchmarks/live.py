@@ -113,7 +113,7 @@ def measure(
     runs: int = 1,
     minutes: float | None = None,
 ) -> dict[str, Any]:
-    """What comes of the images of a camera that does not wait."""
+    """Fate of the images of a camera that does not wait."""
     with tempfile.TemporaryDirectory(prefix='benchmark_live.') as name:
         folder = Path(name)
 

@@ -538,7 +538,7 @@ def _warm_up(one: Run) -> None:
 
 
 def read_record(path: Path) -> Record | None:
-    """A record that was kept; None: there is none, or it is damaged.
+    """A record that was kept; None if it is missing or damaged.
 
     What records of an older checkout lack is unknown, where it may be.
     """

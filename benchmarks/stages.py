@@ -91,7 +91,7 @@ class StageClock:
 
     @contextmanager
     def running(self) -> Iterator[StageClock]:
-        """While it runs, the parts are timed, whoever calls them."""
+        """Time all calls of the parts while it runs."""
         usual = [(owner, name, getattr(owner, name)) for owner, name, _ in self._stages]
         try:
             for (owner, name, stage), (_, _, function) in zip(self._stages, usual, strict=True):

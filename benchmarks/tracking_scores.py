@@ -286,7 +286,7 @@ def procrustes_aligned(points: Array, targets: Array) -> Array:
 
 
 def acceleration_ratio(stamps: NDArray[np.int64], joints: Array, true: Array) -> float:
-    """Mean second difference of joints (T, J, 3) over that of the truth; NaN: there is none."""
+    """Mean second difference of joints (T, J, 3) over the true one; NaN if that is unknown."""
     pairs = _consecutive(stamps)
     three = pairs[1:] & pairs[:-1]
     if not three.any():

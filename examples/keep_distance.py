@@ -49,7 +49,7 @@ def speed_scale(message: Any) -> float:
 
 
 class Nearest:
-    """Share of the usual speed near several people, of whom messages come at any time.
+    """Share of the usual speed near several people, whose messages arrive at any time.
 
     Attributes:
         listed: names of the people who are there, and since when they are known, s.

@@ -1,7 +1,7 @@
-"""Numpy arrays to ROS messages and back, bags in and out, markers and URDF for viewers.
+"""Converts numpy arrays to ROS messages and back, reads and writes bags, makes markers and URDF.
 
-Nothing here needs ROS: the message types come from `rosbags` and from the .msg files in
-`hmt_msgs/`. The same functions serve nodes, which hand over the classes that ROS generates.
+This package does not need ROS: the message types are from `rosbags` and from the .msg files in
+`hmt_msgs/`. Nodes use the same functions with the classes that ROS generates.
 """
 
 from msg_tools.bags.bag_metadata import BagError

@@ -241,7 +241,7 @@ SWITCHES = {
         'OPENCV_IPP': 'sse42',
     },
 }
-# Digests of some topics, and the versions that they hold for. Whoever means to change results puts
+# Digests of some topics, and the versions that they hold for. To change results on purpose, put
 # here what the test finds.
 VERSIONS = {'numpy': '2.4.6', 'cv2': '5.0.0'}
 DIGESTS = {

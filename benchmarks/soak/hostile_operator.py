@@ -1,4 +1,4 @@
-"""The soak of a hostile operator: whoever may call a node's services and publish on its topics.
+"""The soak of a hostile operator, who may call a node's services and publish on its topics.
 
 The node gets images meanwhile, each when the one before is answered: how long it is silent tells
 whether somebody can stop it.

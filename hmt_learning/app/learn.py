@@ -144,7 +144,7 @@ def _add_lifter(parser: CommandParser) -> None:
     parser.add_argument(
         '--resume',
         action='store_true',
-        help='go on with a training that was broken off, marked beside FILE as FILE.resume',
+        help='continue a training that was interrupted, marked beside FILE as FILE.resume',
     )
 
 

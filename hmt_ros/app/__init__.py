@@ -1,4 +1,4 @@
-"""The commands: `python -m hmt_ros <command>`, or each as an executable of its own."""
+"""The commands: `python -m hmt_ros <command>`, or a separate executable for each."""
 
 from __future__ import annotations
 
@@ -39,5 +39,5 @@ and bme_node. In a checkout python -m hmt_learning has the commands that render 
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs a command; 0: done, 1: bad input, which one line on stderr explains."""
+    """Runs a command; returns 0 when done, 1 for bad input (one line on stderr explains it)."""
     return run_program('hmt_ros', COMMANDS, ABOUT, MORE, argv)

@@ -13,13 +13,13 @@ from typing import NoReturn, TypeVar
 import hmt_ros
 from hmt_ros.app.last_resort import last_resort
 
-LARGEST = 10_000  # largest side of an image, px
+LARGEST = 10_000  # maximum side of an image, px
 
 Number = TypeVar('Number', int, float)
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser of arguments for which a bad argument is bad input: one line and exit code 1."""
+    """An argument parser that treats a bad argument as bad input: one line and exit code 1."""
 
     def __init__(self, prog: str, description: str = '', epilog: str = '') -> None:
         super().__init__(
@@ -70,7 +70,7 @@ class CommandParser(argparse.ArgumentParser):
         """Adds the bag, --truth, --topic and --body of a command that reads mixtures.
 
         Args:
-            verb: of the command, 'evaluate' for example.
+            verb: verb of the command, 'evaluate' for example.
         """
         self.add_argument(
             'bag', type=Path, metavar='OUT', help='bag with mixtures: a folder or a file'
@@ -99,7 +99,7 @@ class CommandParser(argparse.ArgumentParser):
 
 
 def gravity_of(arguments: argparse.Namespace) -> list[float] | None:
-    """The direction of gravity that --level or --gravity tell; None: it is not known."""
+    """The direction of gravity from --level or --gravity; None if neither is given."""
     return [0.0, 1.0, 0.0] if arguments.level else arguments.gravity
 
 
@@ -136,7 +136,7 @@ def run_program(
         argv: name and arguments of the command; None: those of the process.
 
     Returns:
-        The exit code: 0: done, 1: bad input, which one line on stderr explains.
+        The exit code: 0 when done, 1 for bad input (one line on stderr explains it).
     """
     words = list(sys.argv[1:] if argv is None else argv)
 
@@ -166,16 +166,16 @@ def run_command(
     *,
     whole_or_nothing: bool = False,
 ) -> int:
-    """Runs a command.
+    """Runs a command with its arguments.
 
     Args:
         parser: parser of its arguments; `prog` is the name of the command.
-        work: the command; it raises ValueError or OSError on bad input.
+        work: function of the command; it raises ValueError or OSError on bad input.
         argv: arguments; None: those of the process.
-        whole_or_nothing: whether an interrupted command writes nothing, which a line then reports.
+        whole_or_nothing: whether an interrupted command writes nothing; a line then reports this.
 
     Returns:
-        The exit code: that of `work`, or see `last_resort`.
+        The exit code of `work`, or of `last_resort` after an exception.
     """
     words = list(sys.argv[1:] if argv is None else argv)
 
@@ -191,17 +191,17 @@ def run_command(
 def number(
     low: float, high: float, *, what: str = 'a number', unit: str = ''
 ) -> Callable[[str], float]:
-    """Reader of a number in a range; errors name the range and the unit."""
+    """Returns a parser of a number in a range; its errors name the range and the unit."""
     return _reader(float, low, high, f'{what} from {low:g} to {high:g}{unit}')
 
 
 def whole_number(low: int, high: int = 2**63 - 1) -> Callable[[str], int]:
-    """Reader of a whole number in a range."""
+    """Returns a parser of a whole number in a range."""
     return _reader(int, low, high, f'a whole number from {low} to {high}')
 
 
 def _reader(kind: type[Number], low: float, high: float, wanted: str) -> Callable[[str], Number]:
-    """Reader of a number of a kind in a range."""
+    """Returns a parser of a number of a type in a range."""
 
     def read(text: str) -> Number:
         with suppress(ValueError):

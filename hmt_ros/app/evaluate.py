@@ -1,6 +1,6 @@
 """evaluate: errors and calibration of the mixtures in a bag against ground truth.
 
-Each topic of pose mixtures or trajectory mixtures is one track; the bag is read once, in its order.
+Each topic of pose mixtures or trajectory mixtures is one track; the bag is read once, in order.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from msg_tools.messages.trajectory_mixtures import (
     trajectory_mixture_of,
 )
 
-# Longest name in a table, and longest row of one with many topics, characters.
+# Maximum length of a name in a table, and of a row of a table, characters.
 LONGEST_CELL, WIDEST_TABLE = 60, 1000
 
 EPILOG = """\
@@ -58,7 +58,7 @@ examples:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; 0: done, 1: bad input, which one line on stderr explains."""
+    """Runs the command; returns 0 when done, 1 for bad input (one line on stderr explains it)."""
     return run_command(_parser(), _evaluate, argv)
 
 
@@ -120,7 +120,7 @@ def as_json(
     model_sigma: float = MODEL_SIGMA,
     verticals: Mapping[str, GravityScores] | None = None,
 ) -> dict[str, Any]:
-    """The object that `--json` prints."""
+    """The JSON object that `--json` prints."""
     return _finite(
         {
             'truth': truth.source,
@@ -143,7 +143,7 @@ def as_json(
 
 
 def _finite(value: Any) -> Any:
-    """The value with None for the numbers that JSON does not have: infinity and NaN."""
+    """The value with None in place of infinity and NaN, which JSON does not have."""
     if isinstance(value, dict):
         return {key: _finite(each) for key, each in value.items()}
     if isinstance(value, list):
@@ -239,16 +239,16 @@ def score_bag(
     seed: int = 0,
     progress: Callable[[int], object] = lambda count: None,
 ) -> dict[str, TrackScores]:
-    """Scores of the topics of a bag, by name in the order of the bag.
+    """Computes the scores of the topics of a bag, by name.
 
     Args:
         topics: names of the topics to score; empty: all topics with mixtures.
         model_sigma: see `hmt_ros.evaluation.pose_scores`, m.
-        body_model: name or file of the body model, for a bag whose own name for it is unknown;
-            None: the model that the bag names.
+        body_model: name or file of the body model, if the name in the bag is unknown; None: the
+            name in the bag.
 
     Raises:
-        ValueError: no mixtures, messages that can not be understood, or no frame with a truth.
+        ValueError: no mixtures, invalid messages, or no frame with a truth.
     """
     with BagReader(path) as bag:
         names = chosen_topics(bag, topics)
@@ -265,10 +265,10 @@ def score_bag(
 
 
 def score_gravity(path: Path, truth: Truth) -> dict[str, GravityScores]:
-    """Scores of the verticals in a bag, by topic; those without a true one are left out.
+    """Computes the scores of the verticals in a bag by topic, if the true one is known.
 
     Raises:
-        ValueError: messages that can not be understood.
+        ValueError: invalid messages.
     """
     with BagReader(path) as bag:
         ups: dict[str, dict[int, tuple[Array, float]]] = {
@@ -284,15 +284,15 @@ def score_gravity(path: Path, truth: Truth) -> dict[str, GravityScores]:
 
 
 def chosen_topics(bag: BagReader, wanted: Iterable[str]) -> list[str]:
-    """Topics of a bag with mixtures other than ground truth: the wanted ones, or all.
+    """Names of the wanted topics of mixtures in a bag, or of all except ground truth.
 
     Raises:
-        ValueError: there are none, or a wanted one has no mixtures.
+        ValueError: no topic has mixtures, or a wanted one has none.
     """
     poses = [x.name for x in bag.topics_of(POSE_MIXTURE) if not is_truth(bag, x.name)]
     trajectories = [x.name for x in bag.topics_of(TRAJECTORY_MIXTURE)]
     present = [*poses, *trajectories] or [
-        topic.name  # of images without anybody
+        topic.name  # images that show nobody
         for topic in bag.topics.values()
         if topic.msgtype == POSE_MIXTURE and not topic.message_count
     ]
@@ -312,7 +312,7 @@ def _read_pose(stored: BagMessage, track: TrackScorer, bodies: RecordedBodies) -
     _check_frame(track, content.frame_id)
     track.kind = content.kind.name.lower()
     if not len(content.weights):
-        return  # nobody was seen: the frame is missing
+        return  # nobody was seen, so the frame counts as missing
     mixture = None if content.covariances is None else content.mixture
     body = None if mixture is None else bodies.of(stored.topic, content)
     track.take(
@@ -328,7 +328,7 @@ def _read_pose(stored: BagMessage, track: TrackScorer, bodies: RecordedBodies) -
 
 
 def _read_trajectories(stored: BagMessage, track: TrackScorer, bodies: RecordedBodies) -> None:
-    """Takes the marginals of a window."""
+    """Adds the marginals of a window to the scores."""
     content = stored.content(trajectory_mixture_of)
     _check_frame(track, content.frame_id)
     track.kind = 'trajectories'

@@ -35,11 +35,11 @@ from msg_tools.messages.pose_mixtures import (
 )
 
 FORMATS = ('.bvh', '.csv', '.npz')
-# Radius of a sphere around the 90 % region of a Gaussian in space, over its largest deviation.
+# Radius of the 90 % region of a 3D Gaussian, in units of its largest standard deviation.
 RADIUS_90 = 2.5003
-# An interval that exceeds the usual one by this factor is a gap.
+# Factor by which an interval exceeds the median one to be a gap.
 _GAP = 1.5
-# A vertical that turns by more tells of a camera that moves, degrees.
+# Turn of the vertical above which the camera has moved, degrees.
 _STILL = 5.0
 
 EPILOG = """\
@@ -84,13 +84,13 @@ class TrackedMotion:
     """One pose at each of T times, of one track on one topic.
 
     Attributes:
-        topic: of the mixtures.
-        steps: (T,) in the order of their stamps.
-        of: the last of the mixtures, for the fields that all have in common.
-        body: at the lengths of the last; None: not known.
+        topic: topic of the mixtures.
+        steps: (T,) poses in the order of their stamps.
+        of: the last mixture, for the fields that are the same in all mixtures.
+        body: body with the segment lengths of the last mixture; None if unknown.
         room: (3, 3) rotation from the frame of the mixtures to axes with y up.
-        height: of the camera in the room, m: above the floor, or 0 where that is not known.
-        notes: for the user, line by line.
+        height: height of the camera above the floor, m; 0 if unknown.
+        notes: lines of text for the user.
     """
 
     topic: str
@@ -103,19 +103,19 @@ class TrackedMotion:
 
     @property
     def times(self) -> Array:
-        """Times (T,) since the first, s."""
+        """Times (T,) since the first pose, s."""
         return np.array([step.stamp_ns - self.steps[0].stamp_ns for step in self.steps]) / SECOND_NS
 
     @property
     def rate(self) -> float:
-        """Usual number of poses a second; 30 of a single pose."""
+        """Median number of poses per second; 30 for a single pose."""
         return 30.0 if len(self.steps) == 1 else float(1.0 / np.median(np.diff(self.times)))
 
     def skeleton(self) -> MovingSkeleton:
-        """The motion as a skeleton, at the lengths of the last pose.
+        """The motion as a skeleton with the segment lengths of the last pose.
 
         Raises:
-            ValueError: the body is not known, or several of its segments move along axes.
+            ValueError: the body is unknown, or several of its segments have translations.
         """
         if self.body is None:
             raise ValueError(
@@ -127,7 +127,7 @@ class TrackedMotion:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; 0: the file is there, 1: bad input, which one line on stderr explains."""
+    """Runs the command; returns 0 when done, 1 for bad input (one line on stderr explains it)."""
     return run_command(_parser(), _export, argv, whole_or_nothing=True)
 
 
@@ -198,14 +198,14 @@ def _export(arguments: argparse.Namespace) -> int:
 
 
 def motion_bytes(motion: TrackedMotion, kind: str, rate: float | None = None) -> bytes:
-    """The content of a file.
+    """Returns the content of the file to write.
 
     Args:
         kind: one of `FORMATS`.
-        rate: poses a second of a .bvh; None: the usual one of the motion.
+        rate: poses per second of a .bvh; None: the median rate of the motion.
 
     Raises:
-        ValueError: a skeleton is wanted, and the body is not known; too many poses.
+        ValueError: a .bvh is wanted and the body is unknown, or there are too many poses.
     """
     if kind == '.csv':
         return _table(motion).encode('utf-8')
@@ -218,7 +218,7 @@ def motion_bytes(motion: TrackedMotion, kind: str, rate: float | None = None) ->
 
 
 def _table(motion: TrackedMotion) -> str:
-    """A row for each time; without radii where covariances are unknown."""
+    """A table with one row per time; it has no radii if covariances are unknown."""
     covariances = _all([step.joint_covariances for step in motion.steps])
     columns = ['x', 'y', 'z']
     numbers = np.array([step.joints for step in motion.steps])
@@ -238,7 +238,7 @@ def _table(motion: TrackedMotion) -> str:
 
 
 def _arrays(motion: TrackedMotion) -> dict[str, Any]:
-    """Arrays by name; without covariances where they are unknown."""
+    """Arrays by name; covariances are left out if unknown."""
     steps, of = motion.steps, motion.of
     names = list(of.segment_lengths)
     result = {
@@ -265,7 +265,7 @@ def _arrays(motion: TrackedMotion) -> dict[str, Any]:
 
 
 def _all(values: Sequence[Array | None]) -> Array | None:
-    """The values as one array; None where one is unknown."""
+    """The values as one array; None if any of them is unknown."""
     return None if any(value is None for value in values) else np.array(values)
 
 
@@ -279,18 +279,18 @@ def read_tracked_motion(
     camera_axes: bool = False,
     progress: Callable[[int], object] = lambda count: None,
 ) -> TrackedMotion:
-    """The motion of a recorded run; of several poses with the same stamp, the first.
+    """Reads the motion of a recorded run; the first of several poses with one stamp counts.
 
     Args:
-        topic: of mixtures over poses; None: of smoothed ones, else of the posterior, else of
+        topic: topic of mixtures over poses; None: smoothed mixtures, else the posterior, else
             predictions.
-        identity: of the motion; None: the heaviest mode at each time.
-        track: its number; None: the one with most poses.
-        body_model: name or file of the body model, for a bag whose own name for it is unknown.
-        camera_axes: whether gravity does not count though it is known.
+        identity: identity of the motion; None: the heaviest mode at each time.
+        track: number of the track; None: the track with the most poses.
+        body_model: name or file of the body model, if the name in the bag is unknown.
+        camera_axes: whether to ignore a known gravity.
 
     Raises:
-        ValueError: no such topic, track or motion, or messages that can not be understood.
+        ValueError: no such topic, track or motion, or invalid messages.
     """
     bodies = RecordedBodies(body_model)
     steps: dict[int, dict[int, TrackedPose]] = {}
@@ -350,7 +350,7 @@ def _topic(bag: BagReader, wanted: str | None) -> str:
 def _mixtures(
     bag: BagReader, name: str, bodies: RecordedBodies, progress: Callable[[int], object]
 ) -> Iterator[PoseMixture]:
-    """The mixtures on a topic, which are all over the same variables; teaches the bodies."""
+    """Yields the mixtures on a topic, which must all have the same variables."""
     names: dict[str, tuple[str, ...]] = {}
     for stored in bodies.messages(bag, [name], progress):
         content = stored.content(partial(pose_mixture_of, **names))
@@ -359,7 +359,7 @@ def _mixtures(
 
 
 def _pose(content: PoseMixture, identity: int | None) -> TrackedPose | None:
-    """The heaviest component, or that of the identity; None: it has none."""
+    """The heaviest component, or the heaviest with the identity; None if there is none."""
     assert content.identities is not None
     weights = content.weights
     if identity is not None:
@@ -388,7 +388,7 @@ def _track(
     track: int | None,
     identity: int | None,
 ) -> int:
-    """The track that is wanted, or the longest."""
+    """The wanted track, or else the longest."""
     if not motions:
         raise ValueError(f'{where}: nobody is seen in any mixture')
     if track is not None and track not in motions:
@@ -412,8 +412,8 @@ def _room(path: Path, topic: str, frame_id: str) -> tuple[Array, float, str]:
         return CAMERA_TO_ROOM, 0.0, told
     ups = np.array([ground.up for ground in grounds])
     up = ups.mean(axis=0) / np.linalg.norm(ups.mean(axis=0))
-    # z is against the direction of view, as far as that is level; of a camera that looks straight
-    # down, it goes to the bottom of the image.
+    # z is opposite to the horizontal part of the viewing direction; if the camera looks straight
+    # down, z points to the bottom of the image.
     back = np.array([0.0, 0.0, -1.0]) if abs(up[2]) < 0.99 else np.array([0.0, 1.0, 0.0])
     back -= (back @ up) * up
     back /= np.linalg.norm(back)
@@ -427,7 +427,7 @@ def _room(path: Path, topic: str, frame_id: str) -> tuple[Array, float, str]:
 
 
 def _notes(steps: Sequence[TrackedPose], end: int) -> list[str]:
-    """Notes for a user on a motion whose topic goes on until `end`, ns."""
+    """Notes for the user on a motion; the last message of its topic is at `end`, ns."""
     notes = []
     others = np.array([a.identity != b.identity for a, b in pairwise(steps)], dtype=bool)
     if others.any():

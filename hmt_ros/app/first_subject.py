@@ -1,7 +1,7 @@
 """The start of a track from the keypoints of a detector in one image of a bag, as a subject file.
 
-The schemes of keypoints say at which joint a landmark lies (`hmt_ros.image.keypoint_schemes`).
-Eyes, ears and nose are left out: they do not lie at a joint.
+The keypoint schemes define the joint of each landmark (`hmt_ros.image.keypoint_schemes`). Eyes,
+ears and nose are left out, because they are not at a joint.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.keypoints import keypoints_of
 
-# Joints that an image to start from shows, and how many of them.
+# Joints that the image of the start should show, and minimum number of them.
 WANTED = tuple(
     f'{side}_{joint}'
     for joint in ('hip', 'shoulder', 'knee', 'ankle', 'elbow', 'wrist')
     for side in ('left', 'right')
 )
 ENOUGH = 10
-FEWEST = 4  # that a subject file may have
+FEWEST = 4  # minimum number of joints in a subject file
 CONFIDENT = 0.5
-# The landmark of a head that lies at its joint.
+# Landmark of the head at its joint.
 _CENTRE_OF_HEAD = 'centre_of_head'
-# Standard deviation of a keypoint, in sizes of the person in the image, and at least, px.
+# Standard deviation of a keypoint in sizes of the person in the image, and its minimum, px.
 SIGMA, LEAST_SIGMA = 0.03, 2.0
 
 
@@ -40,8 +40,8 @@ class Seen:
     """Joints in an image.
 
     Attributes:
-        stamp_ns: of the image.
-        joints: under the names of the body, those that were seen with confidence.
+        stamp_ns: stamp of the image.
+        joints: joints that were seen with confidence, under the names of the body.
     """
 
     stamp_ns: int
@@ -49,20 +49,20 @@ class Seen:
 
     @property
     def count(self) -> int:
-        """Number of the wanted joints among them."""
+        """Number of wanted joints that were seen."""
         return len({*self.joints.names} & {*WANTED})
 
     @property
     def is_enough(self) -> bool:
-        """Whether a track can start well from them."""
+        """Whether a track can start well from these joints."""
         return self.count >= ENOUGH and {*WANTED[:4]} <= {*self.joints.names}
 
 
 def find_start(path: Path, body: Body) -> Seen:
-    """The joints in the image of a bag that a track starts from.
+    """Finds the joints in the image of a bag from which a track starts.
 
-    That is the first image that shows `ENOUGH` of the `WANTED` joints with confidence, all hips and
-    shoulders among them; else the image that shows most of them.
+    This is the first image that shows `ENOUGH` of the `WANTED` joints with confidence, including
+    hips and shoulders, or else the image that shows the most.
 
     Raises:
         ValueError: the bag has no keypoints, or too few in each image.
@@ -89,10 +89,10 @@ def find_start(path: Path, body: Body) -> Seen:
 
 
 def joints_of(keypoints: Keypoints, body: Body) -> Keypoints:
-    """The joints of a body at which confident landmarks lie, under the names of the body.
+    """The joints of a body with confident landmarks, under the names of the body.
 
-    A landmark that has the name of the joint stands for it; if the detector has none of that name,
-    the mean of those at the joint does, as of the fingers for the hand.
+    A landmark with the name of the joint represents it. If the detector has none of this name, the
+    mean of the landmarks at the joint does, for example of the fingers for the hand.
     """
     names, known = keypoints.names, body.joint_names
     sure = keypoints.seen & (keypoints.confidences >= CONFIDENT)
@@ -112,7 +112,7 @@ def joints_of(keypoints: Keypoints, body: Body) -> Keypoints:
 
 
 def subject_text(seen: Seen, stature: float) -> str:
-    """The subject file of a person of some stature, m."""
+    """The text of the subject file of a person with a stature, m."""
     pixels = seen.joints.pixels
     sigma = max(SIGMA * float(np.ptp(pixels, axis=0).max()), LEAST_SIGMA)
     lines = [

@@ -1,4 +1,4 @@
-"""The border of a program: whatever it meets becomes a line on stderr and an exit code."""
+"""Turns every exception of a program into a line on stderr and an exit code."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from typing import Any, TextIO
 from hmt_ros.app.progress import LineFile, tell_user
 from msg_tools.files.error_line import LONGEST_LINE, error_line, one_line
 
-# Exit codes of programs that the interrupt key or SIGPIPE has ended, as shells report them; that of
-# another signal is this and its number.
+# Exit codes after the interrupt key and after SIGPIPE, as in shells; number that is added to other
+# signals.
 INTERRUPTED, NOBODY_READS, SIGNALLED = 130, 141, 128
 _HINT = '; --debug shows where'
 
@@ -29,29 +29,29 @@ def last_resort(
     """Runs a program; any exception becomes one line of at most `LONGEST_LINE` on stderr.
 
     Args:
-        debug: whether the traceback of an error is printed, too.
-        lost: what becomes of the work when the interrupt key ends it.
+        debug: whether to print the traceback of an error as well.
+        lost: text after "interrupted" about the lost work.
 
     Returns:
-        The exit code: that of `run`; 1 after an error; `INTERRUPTED`; or `NOBODY_READS` once the
-        reader of stdout, say head, has ended.
+        The exit code: that of `run`; 1 after an error; `INTERRUPTED`; or `NOBODY_READS` if the
+        reader of stdout, for example head, has ended.
 
     Raises:
-        SystemExit: SIGTERM or SIGHUP asks the process to end.
+        SystemExit: the process received SIGTERM or SIGHUP.
     """
-    # A file that is written must not take the place of one that is closed.
+    # A new file must not get the descriptor of a closed stdout or stderr.
     sys.stdout, sys.stderr = sys.stdout or _nowhere(1), sys.stderr or _nowhere(2)
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is signal.SIG_DFL:
-            # As an exception, the signal has what is unfinished removed.
+            # An exception makes context managers remove unfinished files.
             signal.signal(number, lambda seen, _: sys.exit(SIGNALLED + seen))
-    # The finalisers of what an error held run, and may print, while stderr is still redirected.
+    # Finalisers of objects of an error may print, which must happen while stderr is redirected.
     with nullcontext() if debug else _told_in_lines(program):
         try:
             try:
                 return run()
             finally:
-                # Else the interpreter finds the closed pipe at its end, and prints an error.
+                # Otherwise the interpreter finds the closed pipe at exit, and prints an error.
                 sys.stdout.flush()
         except BrokenPipeError:
             code = NOBODY_READS
@@ -69,23 +69,22 @@ def last_resort(
     try:
         sys.stdout.flush()
     except OSError:
-        # The interpreter would write what is buffered at its end, and print an error.
+        # The interpreter would write the buffer at exit, and print an error.
         _nowhere(sys.stdout.fileno())
     return code
 
 
 def _nowhere(number: int) -> TextIO:
-    """The null device as the open file of a number."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), number)  # they may be the same
+    """Opens the null device with a file descriptor number."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), number)  # both may be equal
     return os.fdopen(number, 'w', encoding='utf-8', closefd=False)
 
 
 @contextmanager
 def _told_in_lines(program: str) -> Iterator[None]:
-    """Has all that is printed beside the results come as lines for the user.
+    """Prints warnings, logs, and errors in threads and finalisers as lines for the user.
 
-    So do warnings, and what ends in other threads or in a finaliser. What libraries in C print,
-    libpng about a damaged image for example, is dropped.
+    Output of C libraries on stderr, for example of libpng about a damaged image, is dropped.
     """
 
     def tell(error: BaseException, *_: object) -> None:
@@ -112,7 +111,7 @@ def _told_in_lines(program: str) -> Iterator[None]:
 
 @contextmanager
 def _replaced(module: ModuleType, **values: Any) -> Iterator[None]:
-    """Replaces variables of a module for a while."""
+    """Replaces variables of a module within the context."""
     usual = {name: getattr(module, name) for name in values}
     vars(module).update(values)
     try:

@@ -2,7 +2,7 @@
 
     lift walk.json -o walk --fov 60 --size 1280x720 --fps 30
 
-See `experts.lifter`; with images, `track-video` says more.
+See `experts.lifter`; with images `track-video` is more accurate.
 """
 
 from __future__ import annotations
@@ -58,14 +58,15 @@ from msg_tools.messages.headers import FRAME_ID, SECOND_NS, START_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
 LIFTED, REPORT = 'lifted', 'report'
-# Part of gravity along the optical axis above which poses are checked that were lifted without it.
+# Component of gravity along the optical axis above which it is checked with poses that were
+# lifted without gravity.
 STEEP = 0.8
-# Ratio of a distance to the median of those within so many seconds at which it leaps, and share of
-# the images in which it may.
+# Ratio of a distance to the local median at which it leaps, half width of the window of the median,
+# s, and fraction of images with leaps above which the user is warned.
 LEAP, NEIGHBOURS, RARE = 1.5, 1.0, 0.05
-# Lean of the trunk above which a person lies, rad.
+# Angle between trunk and vertical above which a person lies, rad.
 LYING = np.radians(55.0)
-# Frames without an entry get an empty mixture, unless they are so many for each with one.
+# Frames without an entry get an empty mixture, up to this number of frames per entry.
 _GAPS = 1000
 
 EPILOG = """\
@@ -87,7 +88,7 @@ exit code: 0 done, 1 bad input (one line on stderr explains it), 130 interrupted
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; 0: the poses are there, 1: bad input, which one line on stderr explains."""
+    """Runs the command; returns 0 when done, 1 for bad input (one line on stderr explains it)."""
     return run_command(_parser(), _lift, argv)
 
 
@@ -224,7 +225,7 @@ def _lift(arguments: argparse.Namespace) -> int:
 def _in_frames(
     found: FoundPersons, chosen: dict[int, Keypoints], fps: float
 ) -> tuple[list[int], list[Keypoints]]:
-    """Times, ns, and keypoints of the chosen person, without names where there are none."""
+    """Times, ns, and keypoints of the chosen person; `NO_KEYPOINTS` where there are none."""
     sparse = found.timed or found.last > _GAPS * len(found.frames)
     keys = found.keys if sparse else list(range(found.last + 1))
     times = keys if found.timed else [round(key * SECOND_NS / fps) for key in keys]
@@ -232,10 +233,10 @@ def _in_frames(
 
 
 def _up(seen: Sequence[Keypoints], body: Body, arguments: argparse.Namespace) -> Array | None:
-    """Unit vector (3,) against gravity as it is given, camera frame; None: it is not.
+    """Unit vector (3,) opposite to the given gravity, camera frame; None if it is not given.
 
-    Where gravity points to the head of the person, an accelerometer has measured it: the opposite
-    is used, which is told.
+    If the given gravity points to the head of the person, it is the reading of an accelerometer;
+    its sign is reversed, and the user is notified.
     """
     gravity = gravity_of(arguments)
     if gravity is None:
@@ -251,10 +252,10 @@ def _up(seen: Sequence[Keypoints], body: Body, arguments: argparse.Namespace) ->
 def _with_leaps(
     mixtures: Sequence[GaussianMixture | None], stamps: Sequence[int]
 ) -> list[GaussianMixture | None]:
-    """Mixtures that are as uncertain of the distance as it leaps, which is told.
+    """Widens the mixtures along the line of sight where the distance leaps.
 
-    So little of a person may be in view that her pose, and with it the distance, is not known from
-    image to image: no one walks so fast.
+    So little of a person may be in view that the pose, and with it the distance, changes more from
+    image to image than a person can walk. The user is warned if many images have such leaps.
     """
     posed = [i for i, one in enumerate(mixtures) if one is not None]
     places = np.array([one.means[0, :3] for one in mixtures if one is not None]).reshape(-1, 3)
@@ -284,7 +285,7 @@ def _with_leaps(
 
 
 def _check_gravity(up: Array, body: Body, mixtures: Sequence[GaussianMixture]) -> None:
-    """Tells where most poses lie by the given vertical (3,)."""
+    """Warns the user if the person lies in most poses according to the given vertical (3,)."""
     joints = body.joint_positions(np.array([one.means[0] for one in mixtures]))
     neck, pelvis = body.skeleton.joint_index(('neck', 'pelvis'))
     trunk = joints[:, neck] - joints[:, pelvis]
@@ -299,7 +300,7 @@ def _check_gravity(up: Array, body: Body, mixtures: Sequence[GaussianMixture]) -
 
 
 def _body(camera: Camera, arguments: argparse.Namespace) -> Body:
-    """The body with the lengths of the person, as far as they are known."""
+    """The body with the segment lengths of the person, if they are known."""
     body = load_body('human37')
     if arguments.subject is not None:
         subject = read_subject(arguments.subject, body)

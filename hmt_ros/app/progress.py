@@ -1,7 +1,7 @@
-"""Progress of a command on stderr: a bar of tqdm on a terminal, a line every few seconds elsewhere.
+"""Progress of a command on stderr: a tqdm bar on a terminal, else a line every few seconds.
 
-Both come from a thread, so that a step which takes long shows that the command still works.
-stdout is left to results.
+A thread prints both, so that the command shows activity during long steps. Only results are printed
+on stdout.
 
     with show_progress(str(output), 'images', total=120) as bar:
         for image in images:
@@ -24,25 +24,25 @@ from msg_tools.files.error_line import LONGEST_LINE, one_line, printable
 
 Item = TypeVar('Item')
 Progress: TypeAlias = 'tqdm[Any]'
-Tell = Callable[[str], object]  # a line for the user
+Tell = Callable[[str], object]  # shows a line to the user
 
-INTERVAL = 3.0  # s, between two lines; a bar shows the time every second
+INTERVAL = 3.0  # time between two lines, s; a bar shows the time every second
 
 
 class LineFile:
-    """A file that prints what is written to it, the state of a bar say, as a line on stderr."""
+    """A file that prints all written text, for example the state of a bar, as lines on stderr."""
 
     def write(self, text: str) -> None:
-        """Prints what tqdm would draw over its last state; nothing where it clears that."""
+        """Prints a new state of tqdm as a line; ignores the blanks that clear the last state."""
         if text.strip():
             print(printable(text.strip()), file=sys.stderr, flush=True)
 
     def flush(self) -> None:
-        """Nothing is kept."""
+        """Does nothing, because nothing is buffered."""
 
 
 class _Bar(tqdm):
-    """A bar that shows the time also while nothing is counted."""
+    """A bar that updates the time even while nothing is counted."""
 
     def __init__(self, interval: float, **options: Any) -> None:
         self._interval, self._ended = interval, Event()
@@ -51,7 +51,7 @@ class _Bar(tqdm):
             Thread(target=self._show_time, name='progress', daemon=True).start()
 
     def __iter__(self) -> Iterator[Any]:
-        """Counts each item at once; tqdm would count when it draws, which the thread does here."""
+        """Counts each item at once; tqdm counts only when it draws, which the thread does here."""
         try:
             for item in self.iterable:
                 yield item
@@ -61,11 +61,11 @@ class _Bar(tqdm):
 
     def _show_time(self) -> None:
         while not self._ended.wait(self._interval):
-            self.delay = 0  # what has been shown is shown at the end, too
+            self.delay = 0  # tqdm then also shows the final state
             self.refresh()
 
     def close(self) -> None:
-        """Removes the bar, or leaves it."""
+        """Ends the thread and closes the bar."""
         self._ended.set()
         super().close()
 
@@ -76,9 +76,9 @@ def show_progress(
     """The progress of a command, as a bar or as lines.
 
     Args:
-        what: name of a file that is made, or a verb such as 'reading'.
+        what: name of the new file, or a verb such as 'reading'.
         unit: name of the unit, in the plural; '' if nothing is counted.
-        total: number of units of the whole; None if unknown.
+        total: total number of units; None if unknown.
     """
     return with_progress(None, what, unit, total, quiet=quiet)
 
@@ -91,15 +91,15 @@ def with_progress(
     *,
     quiet: bool = False,
 ) -> tqdm[Item]:
-    """The items; shows how many of them are done. None: `update` counts."""
+    """Yields the items and shows the number of finished ones; without items `update` counts."""
     options: dict[str, Any] = {'iterable': items, 'unit': f' {unit}', 'total': total}
     options['desc'] = one_line(what)
     if not unit:
         options['bar_format'] = '{desc}: {elapsed} so far'
     if quiet or _is_wide_terminal():
-        # One bar below another is removed at its end.
+        # A bar below another one is removed at its end.
         return _Bar(1.0, **options, disable=quiet, leave=None)
-    # The thread prints all lines, none before the first interval has passed.
+    # The thread prints all lines, the first one after the first interval.
     return _Bar(INTERVAL, **options, file=LineFile(), ncols=0, mininterval=math.inf, delay=math.inf)
 
 
@@ -109,13 +109,13 @@ def tell_user(command: str, text: str) -> None:
 
 
 def say(*texts: object, most: int = LONGEST_LINE) -> None:
-    """Prints results on stdout, in lines of at most `most` characters that can be printed."""
+    """Prints results on stdout, in printable lines of at most `most` characters."""
     for line in '\n'.join(map(str, texts)).split('\n'):
         print(printable(line, most), flush=True)
 
 
 def _is_wide_terminal() -> bool:
-    """Whether stderr is a terminal with room for a bar; those of containers may have no columns."""
+    """Whether stderr is a terminal with room for a bar; some in containers have no columns."""
     try:
         return sys.stderr.isatty() and os.get_terminal_size(sys.stderr.fileno()).columns > 0
     except (OSError, ValueError):

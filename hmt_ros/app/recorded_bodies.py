@@ -1,7 +1,7 @@
-"""The bodies that the mixtures in a bag are about, and the ground that they stand on.
+"""The bodies of the mixtures in a bag, and the ground.
 
-A mixture that carries segment lengths names its own body. One without, of another publisher, is
-about the body on the Body topic of its namespace, or of the bag's only Body topic.
+A mixture with segment lengths defines its own body. A mixture of another publisher may have none;
+its body is that on the Body topic of its namespace, or on the only Body topic of the bag.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ BODY = 'hmt_msgs/msg/Body'
 
 
 def topic_beside(bag: BagReader, msgtype: str, topic: str) -> str | None:
-    """The topic of a type in the namespace of another topic, or else the only one of the bag."""
+    """The topic of a type in the namespace of another topic, or else the only one in the bag."""
     names = [x.name for x in bag.topics_of(msgtype)]
     chosen = [name for name in names if _namespace(name) == _namespace(topic)] or names
     return chosen[0] if len(chosen) == 1 else None
 
 
 class RecordedBodies:
-    """The bodies of the mixtures that are read from a bag.
+    """The bodies of the mixtures in a bag.
 
     Args:
-        model: name or file of the body where the bag's own name for it is not known; None: the
-            bag's.
+        model: name or file of the body model, if the name in the bag is unknown; None: the name in
+            the bag.
     """
 
     def __init__(self, model: str | None) -> None:
@@ -44,13 +44,13 @@ class RecordedBodies:
     def messages(
         self, bag: BagReader, topics: Iterable[str], progress: Callable[[int], object]
     ) -> Iterator[BagMessage]:
-        """The messages on topics of mixtures, when the bodies told before them are known.
+        """Yields the messages on topics of mixtures, and learns the bodies in between.
 
         Args:
             progress: called with the number of messages that were read.
 
         Raises:
-            ValueError: a message about a body that can not be understood; the bag is damaged.
+            ValueError: an invalid message of a body, or the bag is damaged.
         """
         bodies = [x.name for x in bag.topics_of(BODY)]
         for stored in bag.messages([*bodies, *topics]):
@@ -61,7 +61,7 @@ class RecordedBodies:
                 yield stored
 
     def _learn(self, stored: BagMessage) -> None:
-        """Takes a message about a body; a model that is not known leaves the body unknown."""
+        """Learns the body in a message; it stays unknown if its model is unknown."""
         message = stored.message
         try:
             body = resized(self._model_of(str(message.name)), lengths_of(message, 'body'))
@@ -74,7 +74,7 @@ class RecordedBodies:
         self._described[_namespace(stored.topic)] = body
 
     def of(self, topic: str, content: PoseMixture | TrajectoryMixture) -> Body | None:
-        """The body of a mixture on a topic, None: not known; the same object while it stays."""
+        """The body of a mixture on a topic, None if unknown; the same object until it changes."""
         if not content.segment_lengths:
             body = self._described.get(_namespace(topic))
             if body is None and len(self._described) == 1:
@@ -91,20 +91,20 @@ class RecordedBodies:
         return self._newest[topic][1]
 
     def _model_of(self, name: str) -> Body:
-        """The body that was chosen, or that ships under a name; names in bags lead to no files."""
+        """The chosen body, or the shipped body with a name; names in bags are never file names."""
         return named_body(name) if self._model is None else load_body(self._model)
 
 
 def read_grounds(path: Path, topic: str, frame_id: str) -> dict[int, GroundState]:
-    """The ground in a bag, by stamp in ns; empty if it has no such topic.
+    """Reads the ground in a bag, by stamp in ns; empty if the bag has no such topic.
 
     Args:
-        topic: topic of the mixtures that are shown: the ground is on the topic of the same
-            namespace, or else on the only one of the bag.
+        topic: topic of the mixtures; the topic of the ground is in the same namespace, or else the
+            only one of its type in the bag.
         frame_id: frame of the mixtures; a ground in another frame is left out.
 
     Raises:
-        ValueError: a message that can not be understood.
+        ValueError: an invalid message.
     """
     with BagReader(path) as bag:
         chosen = topic_beside(bag, GROUND, topic)

@@ -1,11 +1,11 @@
-"""track-video: from a video to a report: import-video, replay and report in one command.
+"""track-video: runs import-video, replay and report in one command.
 
 track-video walk.mp4
 track-video street.mp4 --people 3
 
-What is not given is found or assumed: keypoints by the detector, where it is installed; the field
-of view by the metadata of the video, else that of common cameras, with an error that is in all
-depths; gravity by the lines of the scene; a folder of images is taken for a usual video.
+Missing arguments are replaced: an installed detector finds the keypoints; the field of view is that
+in the metadata of the video, or else of common cameras, with an error that is in all depths; lines
+of the scene give gravity; a folder of images gets the rate of a usual video.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from hmt_ros.sessions.focal_length import USUAL_FOV, USUAL_SIGMA
 from msg_tools.files.new_folder import new_file
 
 VIDEO, SUBJECT, TRACKED, REPORT = 'video', 'subject.yaml', 'tracked', 'report'
-# Images a second of a folder of images.
+# Assumed rate of a folder of images, images per second.
 USUAL_RATE = 30.0
 
 EPILOG = """\
@@ -63,7 +63,7 @@ exit code: 0 done, 1 bad input (one line on stderr explains it), 130 interrupted
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; 0: the report is there, 1: bad input, which one line on stderr explains."""
+    """Runs the command; returns 0 when done, 1 for bad input (one line on stderr explains it)."""
     return run_command(_parser(), _track, argv)
 
 
@@ -178,7 +178,7 @@ def _track(arguments: argparse.Namespace) -> int:
 
 
 def _assumed(arguments: argparse.Namespace) -> tuple[list[str], list[str]]:
-    """Completes the arguments; settings of the tracker that follow, and what was assumed."""
+    """Completes the arguments; returns settings of the tracker, and notes on assumptions."""
     source, settings, notes = arguments.source, [], []
     if source.is_dir() and any(source.glob('*.mcap')):
         raise ValueError(f'{source} is a bag: replay {source} tracks the person in it')
@@ -202,6 +202,6 @@ def _assumed(arguments: argparse.Namespace) -> tuple[list[str], list[str]]:
 
 
 def _of_gravity(arguments: argparse.Namespace) -> list[str]:
-    """The setting of the tracker that tells how the camera is tilted, if it is known."""
+    """The setting of the tracker for the direction of gravity, if it is given."""
     gravity = gravity_of(arguments)
     return [] if gravity is None else [f'gravity={gravity}']

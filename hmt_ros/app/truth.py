@@ -1,4 +1,4 @@
-"""Readers of true joint positions: from a file of arrays or from the ground truth in a bag."""
+"""Reads true joint positions from a file of arrays or from the ground truth in a bag."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from msg_tools.files.budget import Budget
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, MixtureKind, pose_mixture_of
 
 FIELDS = ('stamps', 'joint_names', 'joints')
-_LARGEST = 2**28  # bytes
-_RECORDS = 4  # that a frame counts for
+_LARGEST = 2**28  # maximum size of the arrays, bytes
+_RECORDS = 4  # number of records that a frame counts as
 _FLOOR = ('gravity', 'camera_height')
 
 
 def read_truth(path: Path) -> Truth:
-    """Truth from a file of arrays (.npz) or from a bag.
+    """Reads the truth from a file of arrays (.npz) or from a bag.
 
     The file has `stamps` (T,) ns, `joint_names` (J,) and `joints` (T, J, 3) m in the camera optical
-    frame, all NaN where nobody is in view. It may have the true floor: `gravity` (T, 3) and
+    frame, all NaN if nobody is in view. It may have the true floor: `gravity` (T, 3) and
     `camera_height` (T,) m, and with them `contact` (T, 2) of the left and right foot, and the pose
-    of a camera that moves in the world: `camera_position` (T, 3) m and `camera_quaternion` (T, 4)
+    of a moving camera in the world: `camera_position` (T, 3) m and `camera_quaternion` (T, 4)
     x y z w.
 
     Raises:
-        ValueError: another file, arrays that are missing or do not fit each other.
+        ValueError: another kind of file, or arrays that are missing or contradictory.
     """
     if path.suffix == '.npz':
         return _from_arrays(path)
@@ -50,7 +50,7 @@ def recorded_truth(path: Path) -> Truth | None:
     """The ground truth in a bag; None if it has none.
 
     Raises:
-        ValueError: there are several, or messages that can not be understood.
+        ValueError: there are several, or a message is invalid.
     """
     with BagReader(path) as bag:
         found = [x.name for x in bag.topics_of(POSE_MIXTURE) if is_truth(bag, x.name)]
@@ -84,7 +84,7 @@ def _from_arrays(path: Path) -> Truth:
 
 
 def _ground(path: Path, content: Mapping[str, Array], stamps: Array) -> dict[int, TrueGround]:
-    """The true floor in a file; nothing where gravity or height of the camera are missing."""
+    """The true floor in a file; empty if gravity or height of the camera are missing."""
     if not set(_FLOOR) <= content.keys():
         return {}
     shapes = {'gravity': (3,), 'camera_height': (), 'contact': (2,)}
@@ -101,7 +101,7 @@ def _ground(path: Path, content: Mapping[str, Array], stamps: Array) -> dict[int
         lengths = np.linalg.norm(known['gravity'], axis=1)
     if not ((lengths > 0) & np.isfinite(lengths) & np.isfinite(known['camera_height'])).all():
         raise ValueError(f'{path}: gravity or camera_height is zero or not finite somewhere')
-    # Without the pose of the camera it rests.
+    # Without its pose the camera is at rest.
     moves = {'camera_position', 'camera_quaternion'} <= known.keys()
     return {
         int(stamp): TrueGround(

@@ -1,9 +1,9 @@
-"""Mixtures over the angles of a body that are their own mirror image, and the files they ship in.
+"""Mirror-symmetric mixtures over the angles of a body, and their files.
 
     p(a) = w_0 N(a; m_0, S_0) + sum_k w_k/2 [N(a; m_k, S_k) + N(Ra; m_k, S_k)]
 
-a are the angles of a pose, R their mirror image, left for right. Component 0 is broad: it bounds
-the energy of a pose that resembles nothing learned.
+a are the angles of a pose, Ra their mirror image, left for right. Component 0 is broad: it bounds
+the energy of a pose that is unlike the training data.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from hmt_ros.inference.mixture import GaussianMixture
 
 KIND = 'pose_prior'
 MOST_COMPONENTS = 1000
-# Steps of the climb to the highest density, and the step at which it ends, rad.
+# Maximum number of steps of the ascent to the highest density, and step at which it ends, rad.
 CLIMB, ARRIVED = 1000, 1e-7
-SAME = 1e-4  # difference of two rotations at rest that single precision explains
+SAME = 1e-4  # maximum difference of two rest rotations due to single precision
 
 
 @dataclass(frozen=True, eq=False)
 class AngleMixture:
-    """A mixture over some of the angles of a body, left for right its own mirror image.
+    """A mixture over some of the angles of a body, symmetric under left-right mirroring.
 
     Attributes:
-        skeleton: whose angles; its lengths do not matter.
+        skeleton: skeleton of the angles; its lengths are not used.
         dofs: names of the n degrees of freedom that it covers.
         components: broad component first, then K components; the weight of each of these is that
             of the component and its mirror image together.
@@ -175,7 +175,7 @@ class AngleMixture:
 
 
 def shipped_prior(body: Body) -> AngleMixture | None:
-    """The learned prior that ships for a body; None: there is none for bodies with its angles."""
+    """Return the shipped learned prior for a body, or None if none matches its angles."""
     mixture = _shipped(body.name)
     return (
         mixture if mixture is not None and _same_angles(mixture.skeleton, body.skeleton) else None
@@ -193,7 +193,7 @@ def _same_angles(first: Skeleton, second: Skeleton) -> bool:
         first.dof_names == second.dof_names
         and np.array_equal(first.dof_axes, second.dof_axes)
         and first.mounts.shape == second.mounts.shape
-        # The root may be levelled otherwise.
+        # The root may have another level.
         and np.allclose(first.mounts[1:], second.mounts[1:], atol=SAME)
     )
 
@@ -202,7 +202,7 @@ def read_pose_prior(path: str | Path, body: Body) -> AngleMixture:
     """The learned prior in a file.
 
     Raises:
-        FileNotFoundError: there is no such file.
+        FileNotFoundError: the file does not exist.
         ValueError: the file is damaged, none of this format, or of another body; one line.
     """
     return read_model(path, KIND, partial(AngleMixture.from_arrays, skeleton=body.skeleton))

@@ -1,12 +1,12 @@
 """The body: its skeleton, its flesh, and the prior of its poses.
 
-Symmetries are poses that a camera takes for each other:
+Symmetries are pairs of poses that look alike to a camera:
 
     p(dt) = (1 - exp(-2 q dt)) / 2        q: rate of the symmetry, 1/s                          (1)
 
 A symmetry maps a pose to another one with nearly the same image. p is the probability that after dt
-seconds the other pose is taken for the one: of a two-state chain that goes over q times a second.
-The model file has the table; what a map does is defined by `MAPS`.
+seconds the mapped pose is taken for the pose: that of a two-state chain that switches q times a
+second. The model file has the table of rates; `MAPS` defines the maps.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import product
 from hmt_ros.inference.logistic import probability_of
 
-# How a part of the flesh differs from that of the model, column by column: logarithms of factors on
-# the x and y radii, distances by which it exceeds the start and the end of its segment more than
-# the model's, and its shift along the y axis, m.
+# Columns of the growth, the difference of a part of the flesh from the model's: log factors on the
+# x and y radii, additional extent beyond the start and the end of its segment, m, and shift along
+# the y axis, m.
 GROWTH = ('width', 'depth', 'start', 'end', 'shift')
 # Angles of a root that can be levelled.
 ROOT_ANGLES = ('root_z', 'root_y', 'root_x')
-# Half of the least height of a part, m.
+# Minimum half height of a part, m.
 LEAST_HEIGHT = 5e-3
 
 
 @dataclass(frozen=True)
 class PartShape:
-    """How a part of the flesh follows from the lengths of the body.
+    """Shape of a part of the flesh as a function of the lengths of the body.
 
     Attributes:
         segment: index of the segment that carries the part.
@@ -52,7 +52,8 @@ class PartShape:
         exponents, taper, bend: shape parameters, as in `Superquadric`.
         extend: distances by which the part exceeds the start and the end of the length, m.
         rings: number of rings at which the contour of the part is sampled.
-        size: index of the length with which the part grows in all directions; None: the whole body.
+        size: index of the length with which the part scales in all directions; None: the whole
+            body.
     """
 
     segment: int
@@ -67,11 +68,11 @@ class PartShape:
     size: int | None = None
 
     def part(self, lengths: Array, scale: float, growth: Array) -> Superquadric:
-        """The part.
+        """Return the part for given lengths and growth.
 
         Args:
-            lengths: (L,) of the body, m.
-            scale: of the part against the model file.
+            lengths: (L,) lengths of the body, m.
+            scale: size of the part relative to the model file.
         """
         width, depth, more_start, more_end, shift = (float(x) for x in growth)
         start, end = scale * self.extend[0] + more_start, scale * self.extend[1] + more_end
@@ -108,12 +109,12 @@ class Body:
         stature_lengths, stature_extra: the stature is the sum of these lengths plus the extra (m,
             at the default lengths; it scales with them).
         default_lengths: (L,) lengths of the model file, m.
-        symmetries: poses that a camera takes for each other, by map; see `Symmetry`.
+        symmetries: symmetries by map; see `Symmetry`.
         joint_errors: (J,) standard deviation of a coordinate of each joint, relative to the pelvis,
             that all poses share, because people's joints are not exactly the model's, m.
-        growth: (B, 5) how each part differs from the model's; see `GROWTH`.
-        level: (3, 3) rotation from the axes that the angles of the root are measured against to
-            those of the camera; see `levelled`.
+        growth: (B, 5) difference of each part from the model's; see `GROWTH`.
+        level: (3, 3) rotation from the reference axes of the root's angles to the axes of the
+            camera; see `levelled`.
     """
 
     skeleton: Skeleton
@@ -194,7 +195,7 @@ class Body:
 
     @cached_property
     def chain_pairs(self) -> tuple[tuple[str, str], ...]:
-        """Names of the chains that are the left and the right one of a pair."""
+        """Pairs of names of left and right chains."""
         return sided_pairs(self.skeleton.chains)
 
     @property
@@ -204,7 +205,7 @@ class Body:
 
     @cached_property
     def trunk_pairs(self) -> tuple[tuple[str, str], ...]:
-        """Names of the left and right joints of the trunk, which tell where the person faces."""
+        """Pairs of names of left and right trunk joints, which show where the person faces."""
         return sided_pairs(self.skeleton.trunk_joints)
 
     @property
@@ -261,7 +262,7 @@ class Body:
         return kinematics.joint_positions(self.skeleton, poses)
 
     def relative_joints(self, poses: ArrayLike) -> Array:
-        """Joints (N, J, 3) of poses (N, d) relative to the first, m, for comparisons of poses."""
+        """Joints (N, J, 3) of poses (N, d) relative to the first joint, m, to compare poses."""
         return kinematics.joint_positions(self.skeleton, poses, relative=True)
 
     def joint_jacobians(self, poses: ArrayLike) -> Array:
@@ -272,16 +273,16 @@ class Body:
         return kinematics.point_jacobians(frames, segments, points)
 
     def with_segment_lengths(self, lengths: Mapping[str, float]) -> Body:
-        """The same body with other values (m) of some lengths.
+        """Return the same body with other values (m) of some lengths.
 
         Raises:
-            KeyError: a name that the body does not have.
-            ValueError: a length that is not finite.
+            KeyError: the body has no length of this name.
+            ValueError: a length is not finite.
         """
         return replace(self, skeleton=self.skeleton.with_lengths(lengths))
 
     def with_stature(self, stature: float) -> Body:
-        """The same body, all lengths and their spread scaled so that the person is this tall, m.
+        """Return the same body with all lengths and their spread scaled to a stature, m.
 
         Raises:
             ValueError: the stature is not a positive number.
@@ -294,17 +295,17 @@ class Body:
         return replace(self, skeleton=skeleton, length_covariance=covariance)
 
     def with_growth(self, growth: ArrayLike) -> Body:
-        """The same body with parts that differ otherwise from the model's, (B, 5); see `GROWTH`.
+        """Return the same body with another growth (B, 5) of the parts; see `GROWTH`.
 
         Raises:
-            ValueError: another shape, or numbers that are not finite.
+            ValueError: the shape is wrong, or a number is not finite.
         """
         return replace(self, growth=np.asarray(growth, dtype=np.float64))
 
     def with_beliefs(
         self, *, prior_sigma: Array | None = None, joint_errors: Array | None = None
     ) -> Body:
-        """The same body with another prior or other errors, which leave its flesh as it is."""
+        """Return the same body with another prior or other errors; the flesh is unchanged."""
         result = replace(
             self,
             prior_sigma=self.prior_sigma if prior_sigma is None else prior_sigma,
@@ -314,14 +315,14 @@ class Body:
         return result
 
     def levelled(self, level: Array) -> Body:
-        """The same body, with the angles of the root measured against other axes.
+        """Return the same body with the angles of the root measured from other axes.
 
-        Somebody upright is then far from the poles and the limits of these angles, however the
-        camera is turned. Translations stay in the axes of the camera. A body whose root has other
-        angles keeps its level.
+        An upright person is then far from the poles and the limits of these angles, whatever the
+        orientation of the camera. Translations stay in the axes of the camera. A body whose root
+        has other angles keeps its level.
 
         Args:
-            level: (3, 3) rotation from those axes, of an upright camera, to the camera's.
+            level: (3, 3) rotation from those axes, which are of an upright camera, to the camera's.
         """
         if np.array_equal(level, self.level) or not {*ROOT_ANGLES} <= {*self.dof_names}:
             return self
@@ -334,7 +335,7 @@ class Body:
         return float(sum(lengths[names.index(x)] for x in self.stature_lengths)) or 1.0
 
 
-# The maps, and the part of the class of a pose that each changes.
+# The maps, and the part of the pose class that each map changes.
 MAPS: Mapping[str, str] = MappingProxyType(
     {
         'reversal': 'the way to face: the whole pose in a mirror across the line of sight',
@@ -350,7 +351,7 @@ class Symmetry:
     """A symmetry of a body.
 
     Attributes:
-        rate: How often tracks take the mapped pose for the pose, 1/s.
+        rate: Rate of switching to the mapped pose, 1/s.
     """
 
     rate: float
@@ -364,7 +365,7 @@ class Symmetry:
         return float(-0.5 * elementary.expm1(-2.0 * self.rate * dt))
 
     def price(self, dt: float) -> float:
-        """-log p(dt), nats; of no time it is infinite."""
+        """-log p(dt), nats; infinite at dt = 0."""
         return -float(elementary.log(self.probability(dt))) if dt > 0.0 else math.inf
 
     def after(self, log_odds: float, dt: float) -> float:
@@ -375,10 +376,10 @@ class Symmetry:
 
 
 def symmetries_of(entries: Mapping[str, Any]) -> Mapping[str, Symmetry]:
-    """The table of a model file: rates by map.
+    """Build the symmetries of a model file from its rates by map.
 
     Raises:
-        ValueError: a map that is unknown or missing, or a rate that is not positive.
+        ValueError: a map is unknown or missing, or a rate is not positive.
     """
     if set(entries) != set(MAPS):
         raise ValueError(f'symmetries: wanted rates of {list(MAPS)}, saw {list(entries)}')

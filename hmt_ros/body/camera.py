@@ -3,9 +3,9 @@
 Frame: camera optical frame of REP 103, x right, y down, z forward, m. Pixels: column u, row v, the
 centre of the first pixel at (0, 0).
 
-A `Viewpoint` says where a still camera stands over a level floor. The world of rendered motions has
-its origin on the floor, straight in front of the camera. A person at rest there faces the camera: x
-to the person's right (left in the image), y towards the camera, z up.
+A `Viewpoint` is the pose of a still camera above a level floor. The world of rendered motions has
+its origin on the floor, straight in front of the camera. A person in the rest pose there faces the
+camera: x to the person's right (left in the image), y towards the camera, z up.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ DISTORTION_MODELS = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (8,), 'equid
 # Axes of a camera, in rows: right, down and ahead.
 AXES = np.eye(3)
 AXES.setflags(write=False)
-# Against gravity, for an upright camera.
+# Direction against gravity in the frame of an upright camera.
 IMAGE_UP = np.array([0.0, -1.0, 0.0])
 IMAGE_UP.setflags(write=False)
-# Distances between which a lens of so many degrees sees 95 % of people, m.
+# Distances between which 95 % of people are seen, m, by a lens of this usual angle of view, rad.
 NEAREST_PERSON, FARTHEST_PERSON, USUAL_LENS = 0.4, 15.0, np.radians(60.0)
 
-NEAR = 0.01  # least depth of a point that has an image, m
-# Least part of the vertical across the optical axis by which a camera has a roll.
+NEAR = 0.01  # minimum depth of a point with a pixel, m
+# Minimum component of the vertical across the optical axis that determines the roll.
 STEEP = 0.1
-# Tangents at which a distortion is checked, and the largest factor by which a lens magnifies more
-# farther out: calibrations of real lenses reach 2.5, at the corners of wide images.
+# Tangents of the angles where a distortion is checked, and maximum growth of the magnification
+# farther out; calibrations of real lenses reach 2.5, at the corners of wide images.
 _TURNS = 0.499 * np.pi * np.linspace(0.0, 1.0, 300) ** 2
 CHECKED = elementary.sin(_TURNS) / elementary.cos(_TURNS)
 LARGEST_RISE = 4.0
-# Part of the way from the principal point to a corner on which a distortion must not fold. The ends
-# of the longer side lie there; polynomials of real calibrations may fold farther out.
+# Fraction of the way from the principal point to a corner where a distortion must not fold. It
+# covers the ends of the longer side; polynomials of real calibrations may fold farther out.
 LEAST_UNFOLDED = 0.8
 
 # Models of distortion in compiled code.
@@ -51,9 +51,9 @@ LENSES = {'plumb_bob': 0, 'rational_polynomial': 0, 'equidistant': 1}
 
 
 class Lens(NamedTuple):
-    """A camera as compiled code reads it: fx fy cx cy, model (-1: no distortion), coefficients.
+    """A camera for compiled code: fx fy cx cy, model (-1: no distortion), coefficients.
 
-    `near` is the least depth of a point that has a pixel, m.
+    `near` is the minimum depth of a point with a pixel, m.
     """
 
     focal: tuple[float, float]
@@ -123,10 +123,10 @@ class Camera:
             )
 
     def scaled(self, width: int, height: int) -> Camera:
-        """The same camera with images of another size, px.
+        """Return the same camera with images of another size, px.
 
         Raises:
-            ValueError: the size has another shape, beyond rounding to whole pixels.
+            ValueError: the aspect ratio differs, beyond rounding to whole pixels.
         """
         if abs(width * self.height - height * self.width) >= max(self.width, self.height):
             raise ValueError(
@@ -146,7 +146,7 @@ class Camera:
 
     @cached_property
     def lens(self) -> Lens:
-        """The camera as compiled code reads it."""
+        """The camera for compiled code."""
         coefficients = (*map(float, self.distortion), *(0.0,) * 8)[:8]
         model = LENSES[self.distortion_model] if self.distortion else -1
         focal, centre = (float(self.fx), float(self.fy)), (float(self.cx), float(self.cy))
@@ -191,7 +191,7 @@ class Camera:
         return pixels, jacobian
 
     def magnification(self, depth: float) -> float:
-        """Pixels for a metre across the optical axis at a depth, m."""
+        """Pixels per metre across the optical axis at a depth, m."""
         return float(np.sqrt(self.fx * self.fy)) / max(depth, NEAR)
 
     def rays(self, pixels: ArrayLike) -> Array:
@@ -251,10 +251,10 @@ class Camera:
 
 @lru_cache(maxsize=64)
 def unfolded_share(camera: Camera) -> float:
-    """The part, 0 to 1, of the way to the corners on which rays farther out lie farther out.
+    """Return the fraction of the way to the corners where the distortion does not fold, 0 to 1.
 
-    From the principal point to each corner the distorted radius must rise with the ideal one, and
-    nowhere so much faster than farther in that no lens does it.
+    From the principal point to each corner the distorted radius must increase with the ideal one,
+    and its slope must stay below `LARGEST_RISE` times the least slope farther in.
     """
     x, y = (np.array([-0.5, n - 0.5]) for n in (camera.width, camera.height))
     a, b = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
@@ -263,20 +263,20 @@ def unfolded_share(camera: Camera) -> float:
     with np.errstate(all='ignore'):  # a rational model has poles, which lie outside
         radius = elementary.hypot(*camera.distort(*ideal)[0])
         slope = np.diff(radius) / np.diff(CHECKED)
-    # A fold may lead back into the image from outside, which matters to no pixel.
+    # A fold outside the image may map back into it, but affects no pixel.
     reached = np.maximum.accumulate(radius, axis=1)[:, :-1]
-    # In the middle the slope is 1.
+    # The slope at the principal point is 1.
     steepest = LARGEST_RISE * np.minimum.accumulate(slope, axis=1).clip(max=1.0)
     folded = (reached < corners) & ((slope <= 0) | (slope > steepest))
     return float(np.where(folded, reached / corners, 1.0).min())
 
 
 def roll(ups: ArrayLike) -> Array:
-    """Rotations (..., 3, 3) about the optical axis, from an upright camera's axes to a camera's.
+    """Return roll rotations (..., 3, 3) from an upright camera's axes to a camera's.
 
     Args:
-        ups: (..., 3) vectors against gravity, camera frame. Those nearly along the optical axis
-            (`STEEP`), and zeros, tell of no roll.
+        ups: (..., 3) vectors against gravity, camera frame. Vectors nearly along the optical axis
+            (`STEEP`), and zeros, give no roll.
     """
     x, y, _ = np.moveaxis(np.asarray(ups, dtype=np.float64), -1, 0)
     length = elementary.hypot(x, y)
@@ -289,10 +289,10 @@ def roll(ups: ArrayLike) -> Array:
 
 
 def shortest_turn(start: Array, end: Array) -> Array:
-    """The rotation (3, 3) by the least angle that takes a unit vector to another.
+    """Return the rotation (3, 3) by the least angle from one unit vector to another.
 
-    For opposite vectors in the plane of the image, where no rotation is the shortest, it is the one
-    about the optical axis, as when the camera hangs upside down.
+    For opposite vectors, where the shortest rotation is ambiguous, it is half a turn about the
+    optical axis, as for a camera that is mounted upside down.
     """
     cosine = float(product(start, end))
     if cosine <= -1.0 + 1e-9:
@@ -309,12 +309,12 @@ def tangent(angle: float) -> float:
 
 
 def log_prior_of_distance(camera: Camera, distance: float) -> float:
-    """How usual it is that a camera sees a person at a distance, m, in nats below the most usual.
+    """Return the log prior of a person's distance, m, relative to the most likely one, nats.
 
-    Log-normal, and wide: it is a prior, and limits nothing.
+    The prior is log-normal, and wide enough to exclude no distance.
     """
     lens = camera.fx / (0.5 * camera.width / tangent(0.5 * USUAL_LENS))
     middle = math.sqrt(NEAREST_PERSON * FARTHEST_PERSON)
-    # Two standard deviations on either side.
+    # The range spans two standard deviations on either side.
     sigma = float(elementary.log(FARTHEST_PERSON / NEAREST_PERSON)) / 4.0
     return -0.5 * (float(elementary.log(max(distance, 1e-3) / (lens * middle))) / sigma) ** 2

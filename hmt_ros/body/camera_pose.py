@@ -14,7 +14,7 @@ from hmt_ros.inference.linear_algebra import determinant, length, product
 
 # Largest difference of an entry of R R' from the identity for R to be a rotation.
 NOT_ORTHOGONAL = 1e-3
-# Distance of people and of the scene, where it is unknown, m.
+# Default distance of people and of the scene, m.
 USUAL_DISTANCE = 3.0
 
 
@@ -34,7 +34,7 @@ class CameraPose(NamedTuple):
         """A pose from position (3,), m, and rotation (3, 3).
 
         Raises:
-            ValueError: other shapes, numbers that are not finite, or no rotation.
+            ValueError: a shape is wrong, a number is not finite, or the matrix is not a rotation.
         """
         place, turn = np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64)
         if place.shape != AXES[0].shape or not np.isfinite(place).all():
@@ -52,17 +52,17 @@ class CameraPose(NamedTuple):
         return cls(turn, place)
 
     def equals(self, other: CameraPose) -> bool:
-        """Whether the other pose has the very same numbers."""
+        """Whether the other pose has exactly the same numbers."""
         return all(np.array_equal(a, b) for a, b in zip(self, other, strict=True))
 
     def shift(self, other: CameraPose, camera: Camera) -> float:
-        """About how far the images of still points are apart from the two poses, px."""
+        """Approximate the image shift of static points between the two poses, px."""
         angle = length(rotation_vectors(product(self.rotation.T, other.rotation)))
         apart = length(self.position - other.position)
         return float(max(camera.fx, camera.fy) * (angle + apart / USUAL_DISTANCE))
 
     def towards(self, other: CameraPose, share: float) -> CameraPose:
-        """The pose at a share of the constant motion to another pose; 0: here, 1: there."""
+        """Interpolate to another pose by constant motion; share 0: this pose, 1: the other."""
         turn = rotation_vectors(product(self.rotation.T, other.rotation))
         rotation = product(self.rotation, rotations_of(share * turn))
         return CameraPose(rotation, self.position + share * (other.position - self.position))

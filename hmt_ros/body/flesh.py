@@ -41,7 +41,7 @@ class Superquadric:
         radii: semi-axes along x, y and z.
         exponents: shape along the axis and around it; 1 is elliptic, towards 0 boxy.
         taper: relative change of the x and y radii from the middle to the end (s = 1).
-        bend: shift in x and y of the middle against both ends, m.
+        bend: shift in x and y of the middle relative to both ends, m.
     """
 
     segment: int
@@ -80,7 +80,7 @@ class Rings:
 
 
 class Superquadrics(NamedTuple):
-    """P parts as the core reads them: arrays (P, 3) and (P, 2) of the attributes of each."""
+    """P parts for the core: arrays (P, 3) and (P, 2) of their attributes."""
 
     centres: Array
     radii: Array
@@ -90,7 +90,7 @@ class Superquadrics(NamedTuple):
 
 
 def surfaces(parts: Superquadrics, s: Array, w: Array) -> tuple[Array, Array]:
-    """Points and outward unit normals (P, R + 2, 3) of P parts: at R heights and angles, and tips.
+    """Return points and outward normals (P, R + 2, 3) at R heights and angles, and the tips.
 
     s, w: (R,), with heights in (-1, 1).
     """
@@ -119,7 +119,7 @@ class Flesh:
 
     @cached_property
     def table(self) -> Superquadrics:
-        """The parts as the core reads them."""
+        """The parts, for the core."""
         names, sizes = ('centre', 'radii', 'exponents', 'taper', 'bend'), (3, 3, 2, 2, 2)
         return Superquadrics(
             *(
@@ -143,7 +143,7 @@ class Flesh:
         return np.repeat(np.arange(len(self.parts)), self.ring_count)
 
     def mesh(self, stacks: int = 9, slices: int = 12) -> Mesh:
-        """Triangles of all parts: `stacks` rings of `slices` points each, and two tips a part.
+        """Triangulate all parts: `stacks` rings of `slices` points and two tips per part.
 
         Raises:
             ValueError: fewer than 2 stacks, or 3 slices.
@@ -151,7 +151,7 @@ class Flesh:
         return _mesh(self, stacks, slices)
 
     def points_on(self, segment: int, stacks: int = 9, slices: int = 12) -> Array:
-        """Vertices (V, 3) of the same mesh that one segment carries, m."""
+        """Return the vertices (V, 3) of the mesh on one segment, m."""
         own = Flesh(tuple(part for part in self.parts if part.segment == segment))
         return surfaces(own.table, *_grid(stacks, slices))[0].reshape(-1, 3)
 

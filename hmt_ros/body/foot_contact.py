@@ -5,9 +5,9 @@
     motion     log(1 - q + q N(m; 0, S_rest) / N(m; 0, S_free)),  q = c_(t-1) exp(-leave dt) / P
     posterior  logit c_t = logit P + a(dt) (height + motion)
 
-c is the probability that the point rests, m how far it moved since the image before and h its
-height over the floor. A point that rests has stayed with the probability q, and else has come to
-rest since that image. Along the line of sight an image shows little of m, so there both deviations
+c is the probability that the point rests, m its motion since the image before and h its height
+above the floor. A resting point has rested since that image with the probability q; otherwise it
+has come to rest since. Along the line of sight an image shows little of m, so there both deviations
 are wider and nearer to each other. Errors of a pose last, so an image counts with its share a(dt)
 in time (`hmt_ros.inference.error_model`), and the errors of images that are close differ little.
 """
@@ -24,13 +24,13 @@ from hmt_ros.inference.linear_algebra import product
 from hmt_ros.inference.logistic import log_odds, probability_of
 from hmt_ros.inference.markov_chain import MarkovChain
 
-# Rates at which a resting foot leaves the floor, and another comes to rest: those of walking, 1/s.
+# Rates at which a resting foot leaves the floor and a moving one comes to rest in walking, 1/s.
 LEAVES, ENTERS = 1.5, 2.5
 CONTACT = MarkovChain.of_two(ENTERS, LEAVES)
-# How far errors of poses that are long apart move a point that rests, across and along the line of
-# sight, m.
+# Standard deviations of the apparent motion of a resting point between distant times, across and
+# along the line of sight, m.
 REST_ACROSS, REST_ALONG = 0.013, 0.033
-# Speed of a foot that does not rest, m/s: deviation of each component.
+# Standard deviation of each velocity component of a moving foot, m/s.
 FREE_SPEED = 1.0
 # Deviation of the height of a resting point from that of the floor, besides that of the floor
 # itself; height up to which a free foot is lifted, m.
@@ -38,7 +38,7 @@ REST_HIGH, LIFT = 0.04, 0.25
 
 
 def first_contacts(plane: FloorPlane, points: Array) -> Array:
-    """Probabilities (K, P) that points (K, P, 3) of soles rest, of which nothing was known."""
+    """Return the initial probabilities (K, P) that points (K, P, 3) of soles rest."""
     return probability_of(log_odds(CONTACT.usual[1]) + _height_evidence(plane, points))
 
 
@@ -76,7 +76,7 @@ def _height_evidence(plane: FloorPlane, points: Array) -> Array:
 
 
 def _motion_evidence(before: Array, points: Array, dt: float) -> Array:
-    """Log odds (K, P) of rest by how far points (K, P, 3) moved in a time dt, s."""
+    """Return log odds (K, P) of rest from the motion of points (K, P, 3) in a time dt, s."""
     ray = points / np.linalg.norm(points, axis=2, keepdims=True)
     moved = points - before
     along = (moved * ray).sum(2)

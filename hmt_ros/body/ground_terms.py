@@ -3,18 +3,18 @@
     E(x) = w_u sum_s rho(lean_s) + w_f sum_p rho([-h_p]+ / sigma_f)
     rho(r) = (nu + k) / 2 log(1 + r^2 / nu),     k the dimension of r
 
-`lean_s` is the direction of gravity in the frame of pelvis or trunk, less that of somebody
-upright; h_p the height of a point of the sole over the floor. The tails are heavy: people bend and
-lie. A floor that is only known from the feet of the track costs nothing: feet that were taken for
-too high would hold the next ones up.
+`lean_s` is the direction of gravity in the frame of the pelvis or trunk, minus that of an upright
+person; h_p is the height of a point of the sole above the floor. The tails are heavy because people
+bend and lie. A floor that is only known from the feet of the track costs nothing: an overestimate
+of its height would push the next feet up as well.
 
-The soles are where the flesh of the feet meets a floor, and where it rests. The points of a foot
-are those of its flesh that lie farthest down when the foot is flat and pitched by `PITCH` up (heel)
-or down (toe). They move with the flesh when the shape changes.
+The soles are the contact points between the flesh of the feet and a floor. The points of a foot are
+the lowest points of its flesh when the flat foot is pitched by `PITCH` up (heel) or down (toe).
+They move with the flesh when the shape changes.
 
-Shares of the mass of the body and distances of the centres from the upper ends, as shares of the
+Mass fractions of the segments, and distances of their centres from the upper ends relative to the
 lengths, are those of [Winter, Biomechanics and Motor Control of Human Movement, 4th ed. 2009, table
-4.1, after Dempster]. The trunk of 0.497 is there 0.142 pelvis and 0.355 thorax and abdomen.
+4.1, after Dempster]. Its trunk of 0.497 splits into 0.142 pelvis and 0.355 thorax and abdomen.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import product, unit
 
-# Mean lean forwards of trunk and pelvis, and the deviations sideways and forwards or back, rad.
-# People differ: from hips to neck the clips lean from 9 degrees back to 9 forwards in the mean. The
-# median of 16 people of motion capture is 2 degrees back for the trunk and 1 for the pelvis; on the
-# clips 8 is better for the pelvis. Tails are for those who bend.
+# Mean forward lean of trunk and pelvis, and its standard deviations sideways and forwards, rad.
+# People differ: from hips to neck, the mean lean in the clips is from 9 degrees backwards to 9
+# forwards. The median of 16 people in motion capture is 2 degrees backwards for the trunk and 1 for
+# the pelvis; on the clips, 8 works better for the pelvis. The heavy tails allow bending.
 TRUNK_LEAN, TRUNK_SIGMA = 0.0, (np.radians(5.0), np.radians(9.0))
 PELVIS_LEAN, PELVIS_SIGMA = np.radians(-8.0), (np.radians(8.0), np.radians(14.0))
-# The same of the shanks of hidden legs: who stands and who sits has them upright. Legs that an
-# image shows lean as it says.
+# The same for the shanks of hidden legs, which are upright in standing and sitting people. Visible
+# legs lean as the image shows.
 SHANK_LEAN, SHANK_SIGMA = np.radians(5.0), (np.radians(8.0), np.radians(20.0))
-# Depth below the floor that costs 1/2, with an exact plane, m.
+# Standard deviation of the depth below an exact floor plane, m.
 FLOOR_SIGMA = 0.02
-# Degrees of freedom nu of the heavy tails, of the lean and of the floor.
+# Degrees of freedom nu of the heavy tails of the lean and of the floor.
 LEAN_TAILS, FLOOR_TAILS = 2.0, 4.0
 
 
@@ -70,7 +70,7 @@ class GroundSettings:
 
     @property
     def weights(self) -> Array:
-        """(2,) in the order of the attributes."""
+        """Weights (2,) in the order of the attributes."""
         return np.array([self.upright_weight, self.floor_weight])
 
     @property
@@ -81,15 +81,15 @@ class GroundSettings:
 
 @dataclass(frozen=True, eq=False)
 class FloorPlane:
-    """Gravity and floor as the terms see them.
+    """Gravity and floor, as inputs of the terms.
 
     Attributes:
         up: (3,) unit vector against gravity, camera frame.
         up_sigma: standard deviation of its angle, rad.
-        height: of the camera over the floor, m; None: unknown.
+        height: height of the camera above the floor, m; None: unknown.
         height_sigma: standard deviation of the floor's height where the person is, m.
-        measured: whether the height is known apart from the person's own feet. If not, it shows
-            where they stood before, not where they are.
+        measured: whether the height is known independently of the person's own feet. If not, it
+            only describes where the feet were before.
     """
 
     up: Array
@@ -100,19 +100,19 @@ class FloorPlane:
 
 
 class Constants(NamedTuple):
-    """Inputs that do not depend on the pose, as compiled code reads them.
+    """Inputs that do not depend on the pose, for the compiled code.
 
     Attributes:
         dof_is_rotation: (d,).
-        moves: (S, d) whether a degree of freedom moves a segment.
-        weights: (2,) of the terms: upright, floor; 0: off.
-        up: (3,) against gravity.
-        height: of the camera over the floor, m.
+        moves: (S, d) whether each degree of freedom moves each segment.
+        weights: (2,) weights of the upright and the floor term; 0 switches a term off.
+        up: (3,) unit vector against gravity.
+        height: height of the camera above the floor, m.
         upright: (U,) segments that are upright.
         axes: (U, 3, 3) their axes: to the side, ahead, up.
-        lean: (U, 3) deviations of gravity along these, rad.
+        lean: (U, 3) standard deviations of gravity along these axes, rad.
         soles: (P,) segments of the points of the soles.
-        local: (P, 3) their places there, m.
+        local: (P, 3) their positions in the segments' frames, m.
         per_floor: 1 / deviation of the height of the floor, 1/m.
         lean_tails, floor_tails: degrees of freedom of the robust costs.
     """
@@ -134,13 +134,13 @@ class Constants(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GroundTerm:
-    """The sum of the terms.
+    """The sum of the ground terms.
 
     Attributes:
-        body: of the poses.
+        body: body of the poses.
         settings: weights; a weight of 0 leaves a term out.
         plane: gravity and floor.
-        hidden: segments that something hides from the camera.
+        hidden: segments that are hidden from the camera.
     """
 
     body: Body
@@ -150,7 +150,7 @@ class GroundTerm:
 
     @cached_property
     def compiled(self) -> Constants:
-        """As compiled code reads it."""
+        """The constants for the compiled code."""
         body, plane = self.body, self.plane
         skeleton, feet = body.skeleton, soles(body)
         upright = upright_segments(skeleton, self.hidden)
@@ -177,13 +177,13 @@ class GroundTerm:
 
 
 class Upright(NamedTuple):
-    """Segments that are upright in somebody who stands.
+    """Segments that are upright in a standing person.
 
     Attributes:
         segments: (U,).
-        axes: (U, 3, 3) in the frame of each; the rows point to the side, ahead and up when the
-            person stands as usual.
-        sigma: (U, 3) deviations of the vertical along these, rad.
+        axes: (U, 3, 3) axes in the frame of each segment; the rows point to the side, ahead and up
+            when the person stands as usual.
+        sigma: (U, 3) standard deviations of the vertical along these axes, rad.
     """
 
     segments: NDArray[np.intp]
@@ -193,10 +193,10 @@ class Upright(NamedTuple):
 
 @lru_cache(maxsize=16)
 def upright_segments(skeleton: Skeleton, hidden: tuple[int, ...] = ()) -> Upright:
-    """Pelvis and trunk of a skeleton whose root turns about z, y and x; nothing of another.
+    """Return pelvis and trunk of a skeleton whose root turns about z, y and x; else no segments.
 
     Args:
-        hidden: segments that something hides; shanks among these are upright, too.
+        hidden: hidden segments; hidden shanks count as upright, too.
     """
     if not len(_root_turns(skeleton)) or 'neck' not in skeleton.joint_names:
         return Upright(np.zeros(0, dtype=np.intp), np.zeros((0, 3, 3)), np.zeros((0, 3)))
@@ -219,7 +219,7 @@ def upright_segments(skeleton: Skeleton, hidden: tuple[int, ...] = ()) -> Uprigh
 
 
 def _sided(skeleton: Skeleton, kind: str) -> list[int]:
-    """The left and the right joint of a kind; none where one of them is missing."""
+    """Return the left and right joints of a kind, or none if one is missing."""
     names = [f'left_{kind}', f'right_{kind}']
     known = {*names} <= {*skeleton.joint_names}
     return [int(i) for i in skeleton.joint_index(names)] if known else []
@@ -234,12 +234,12 @@ def _at_rest(skeleton: Skeleton) -> tuple[Array, Array, Array]:
 
 
 def _axes(columns: Array, segment: int, along: Array, lean: float) -> Array:
-    """Axes (3, 3) in the frame of a segment: to the side, ahead and up.
+    """Return axes (3, 3) in the frame of a segment: to the side, ahead and up.
 
     Args:
         columns: (S, 3, 3) frames at rest.
-        along: (3,) its long axis upwards, as the columns.
-        lean: how far the long axis leans forwards where the person stands as usual, rad.
+        along: (3,) its long axis upwards, in the same frame as the columns.
+        lean: usual forward lean of the long axis in a standing person, rad.
     """
     up = unit(along)
     ahead = _across(columns[0, 1], up)
@@ -249,18 +249,18 @@ def _axes(columns: Array, segment: int, along: Array, lean: float) -> Array:
 
 
 def _across(vector: Array, axis: Array) -> Array:
-    """The direction (3,) of a vector across a unit vector."""
+    """Return the direction (3,) of the part of a vector that is perpendicular to a unit vector."""
     return unit(vector - axis * (axis * vector).sum())
 
 
 def root_lean_dofs(body: Body) -> Index:
-    """The rotations of the root with a prior (L,): how far it leans, against the camera."""
+    """Return indices (L,) of the root rotations that have a prior on the lean in the camera."""
     turns = _root_turns(body.skeleton)
     return np.asarray(turns[np.isfinite(body.prior_sigma[turns])], dtype=np.intp)
 
 
 def _root_turns(skeleton: Skeleton) -> Index:
-    """The rotations of the root if they are those about z, y and x (3,); else none."""
+    """Return the root rotations (3,) if they are about z, y and x; else none."""
     root = np.array(skeleton.segment_dofs[0], dtype=np.intp)
     turns = root[skeleton.dof_is_rotation[root]]
     names = [skeleton.dof_names[i] for i in turns]
@@ -278,19 +278,19 @@ def without_root_lean(body: Body) -> Body:
 
 
 FEET = ('left', 'right')
-# Pitch of the foot at which its heel and its toe are lowest, rad: 15 degrees.
+# Pitch of the foot that defines the lowest points of heel and toe, rad.
 PITCH = np.radians(15.0)
-# Height of the ankle over the floor as a share of the stature, where a foot has no flesh [Winter,
+# Height of the ankle above the floor over the stature, for a foot without flesh [Winter,
 # Biomechanics and Motor Control of Human Movement, 4th ed. 2009, figure 4.1].
 ANKLE_HEIGHT = 0.039
 
 
 @dataclass(frozen=True, eq=False)
 class Soles:
-    """Points of the soles: heel and toe of the left foot, then of the right one.
+    """Points of the soles: heel and toe of the left foot, then of the right foot.
 
     Attributes:
-        segments: (P,) that carry them; empty for a body without feet.
+        segments: (P,) segments that carry them; empty for a body without feet.
         local: (P, 3) in the frames of the segments, m.
     """
 
@@ -302,7 +302,7 @@ class Soles:
 
 
 def soles(body: Body) -> Soles:
-    """The soles of a body; none where it lacks an ankle or a toe of either side."""
+    """Return the soles of a body; empty if it lacks an ankle or a toe on either side."""
     return _soles(body.skeleton, body.flesh, body.stature)
 
 
@@ -324,7 +324,7 @@ def _soles(skeleton: Skeleton, flesh: Flesh, stature: float) -> Soles:
             points = np.array([heel, own]) + ANKLE_HEIGHT * stature * down
         for sign in (-1.0, 1.0):
             lowest = product(points, cosine * down + sign * sine * ahead)
-            # The middle of the equally low points: left and right of the middle line.
+            # Mean of the equally low points left and right of the middle line.
             local.append(points[lowest > lowest.max() - 1e-6].mean(0))
             segments.append(carrier)
     return Soles(np.array(segments, dtype=np.intp), np.array(local))
@@ -345,7 +345,7 @@ def sole_jacobians(body: Body, poses: Array) -> Array:
 def _down_and_ahead(skeleton: Skeleton, ankle: int, toe: int, carrier: int) -> tuple[Array, Array]:
     """Unit vectors towards the sole and the toe, in the frame of the foot.
 
-    Towards the sole is where the shin points when all angles are 0, across the foot.
+    Towards the sole is the direction of the shin when all angles are 0, perpendicular to the foot.
     """
     columns, origins, joints = _at_rest(skeleton)
     shin = joints[ankle] - origins[skeleton.parents[carrier]]
@@ -353,7 +353,7 @@ def _down_and_ahead(skeleton: Skeleton, ankle: int, toe: int, carrier: int) -> t
     return _across(product(columns[carrier], shin), ahead), ahead
 
 
-# By segment without its side: share of the mass, share of the way from its start to its end.
+# Mass fraction of each segment, and its centre as a fraction of the way from start to end.
 SHARES = {
     'pelvis': (0.142, 0.0),
     'trunk': (0.355, 0.37),
@@ -365,7 +365,7 @@ SHARES = {
     'shin': (0.0465, 0.433),
     'foot': (0.0145, 0.5),
 }
-# Least share of the mass that the segments of a body must have.
+# Minimum mass fraction that the known segments of a body must have.
 LEAST_SHARE = 0.8
 
 
@@ -374,7 +374,7 @@ class Masses:
     """Point masses of the segments.
 
     Attributes:
-        shares: (S,) of the mass of the body, with the sum 1; all 0 where they are not known.
+        shares: (S,) mass fractions with sum 1; all 0 if unknown.
         centres: (S, 3) in the frames of the segments, m.
     """
 
@@ -394,7 +394,7 @@ class Masses:
 
 @lru_cache(maxsize=16)
 def masses(skeleton: Skeleton) -> Masses:
-    """The masses of a skeleton with segments of the names in `SHARES`; else none are known."""
+    """Return the masses of a skeleton with segment names as in `SHARES`; else all unknown."""
     count = len(skeleton.parents)
     shares, centres = np.zeros(count), np.zeros((count, 3))
     for s, name in enumerate(skeleton.segment_names):
@@ -409,10 +409,10 @@ def masses(skeleton: Skeleton) -> Masses:
 
 
 def _end(skeleton: Skeleton, segment: int) -> Array:
-    """Where a segment ends (3,): its farthest joint, or where the next segment starts, m."""
+    """Return the end (3,) of a segment, m: its farthest joint, or the start of the next one."""
     ends = [np.zeros(3), *skeleton.joint_offsets[skeleton.joint_segments == segment]]
     children = [s for s, parent in enumerate(skeleton.parents) if parent == segment]
-    # Of several segments that start here, the middle: both shoulders, or the neck between them.
+    # The mean of several child segments, such as the shoulders and the neck between them.
     if children:
         ends.append(np.mean([skeleton.offsets[s] for s in children], axis=0))
     return np.asarray(max(ends, key=lambda end: float((end * end).sum())), dtype=np.float64)

@@ -1,17 +1,17 @@
-"""The space that a robot keeps out of: capsules that hold the whole person over all modes.
+"""The space that a robot must keep out of: capsules that contain the person in all modes.
 
 Each part of the flesh is a capsule. In every mode its radius is the sum of the flesh, the error of
 the body model and the uncertainty of its place,
 
     r = r_flesh + MARGIN + q s,       q^2 the quantile `probability` of chi^2 with 3 dimensions
 
-s the deviation of its ends in the second direction in which they are known least; along the first,
-which is depth, it is repeated, side by side, over q times the deviation there. Modes are taken,
-heaviest first, until they weigh `probability` together. Capsules that others hold are left out.
-A lost person may have moved since: all capsules are wider by `reach_after` the time since then.
+s is the standard deviation of its ends in the second most uncertain direction. Along the most
+uncertain one, usually depth, the capsule is repeated over q times the deviation. Modes are
+included, heaviest first, until their weights sum to `probability`. Capsules inside others are left
+out. A lost person may have moved: all capsules grow by `reach_after` the time since then.
 
-The guarantee is the coverage that `benchmarks/keep_out.py` measures on clips, and no more: people
-whom the tracker has lost without knowing, and long things that people hold, are outside.
+Only the coverage that `benchmarks/keep_out.py` measures on clips is guaranteed. It excludes people
+whose loss the tracker has not noticed, and long objects in people's hands.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from hmt_ros.inference.mixture import GaussianMixture
 MARGIN = 0.05
 # Radius of a bone of a body without flesh, m.
 BARE = 0.07
-# Distance of capsules side by side, against their radius.
+# Distance of neighbouring capsules over their radius.
 SPACING = 1.2
-# Share of a radius that is added to it rather than covered by capsules side by side.
+# Spread over the radius below which it widens a capsule instead of adding capsules.
 LITTLE = 0.15
 # Cosines and sines of angles around an axis.
 _ANGLES = np.arange(8) * (np.pi / 4)
 _RING = np.stack([elementary.cos(_ANGLES), elementary.sin(_ANGLES)])
 # Speed, m/s, and reach, m, of a striking hand.
 STRIKING_SPEED, ARM_REACH = 7.0, 0.7
-# Speed that a person hardly exceeds, a runner's, m/s.
+# Speed of a runner, which a person hardly exceeds, m/s.
 RUNNING_SPEED = 3.0
 
 
@@ -64,11 +64,11 @@ class Capsules:
         return len(self.radii)
 
     def __getitem__(self, index: Index | Mask | list[Any]) -> Capsules:
-        """Some of them."""
+        """Select capsules."""
         return Capsules(self.starts[index], self.ends[index], self.radii[index])
 
     def depths(self, points: ArrayLike) -> Array:
-        """Depth of points (P, 3) inside of each capsule, (P, N) m; negative: outside."""
+        """Return the depth of points (P, 3) in each capsule, (P, N) m; negative outside."""
         p = np.asarray(points, dtype=np.float64)[:, None]
         axes = self.ends - self.starts
         squares = np.maximum((axes * axes).sum(1), 1e-18)
@@ -81,7 +81,7 @@ class Capsules:
         return np.asarray((self.depths(points) >= 0.0).any(1))
 
     def without_held(self) -> Capsules:
-        """The capsules without those inside of larger ones together, by a few surface points."""
+        """Drop capsules inside the union of larger ones, tested at a few surface points."""
         order = np.argsort(-self._sizes, kind='stable')
         some = self[order]
         axes = (np.ascontiguousarray(x) for x in (some.starts, some.ends))
@@ -90,7 +90,7 @@ class Capsules:
         return self[np.sort(order[kept])]
 
     def grown(self, reach: float) -> Capsules:
-        """The same, wider by a reach, m."""
+        """Return the capsules with radii grown by a reach, m."""
         return Capsules(self.starts, self.ends, self.radii + reach)
 
     @property
@@ -105,15 +105,15 @@ def reach_after(time: float) -> float:
 
 
 def keep_out_capsules(body: Body, mixture: GaussianMixture, probability: float = 0.99) -> Capsules:
-    """Capsules that hold the person with about a probability.
+    """Return capsules that contain the person with about a probability.
 
     Args:
         body: of the poses.
-        mixture: over the pose (d,), the posterior of an image, or a forecast.
-        probability: of each part of the person, and of the modes; below 1.
+        mixture: mixture over the pose (d,), the posterior of an image or a forecast.
+        probability: coverage of each part of the person, and total weight of the modes; below 1.
 
     Raises:
-        ValueError: no modes, or a probability that is not between 0 and 1.
+        ValueError: no modes, or the probability is not between 0 and 1.
     """
     if not len(mixture):
         raise ValueError('no modes; wanted those of a person who is tracked')
@@ -134,16 +134,16 @@ def keep_out_capsules(body: Body, mixture: GaussianMixture, probability: float =
     places = ends.reshape(len(some), -1, 2, 3)
     deep = directions[..., 2].reshape(places.shape)
     across, along = (sigmas[..., i].reshape(places.shape[:3]).max(2) for i in (1, 2))
-    # Both ends go the same way.
+    # Both ends are shifted in the same direction.
     same = np.where((deep[:, :, 0] * deep[:, :, 1]).sum(2) < 0.0, -1.0, 1.0)
     deep[:, :, 1] *= same[:, :, None]
     radius = radii + MARGIN + wide * across
     beyond = wide * np.maximum(along - across, 0.0)
-    # A little is width, and not worth a second capsule.
+    # A small spread widens the capsule and needs no second one.
     little = beyond < LITTLE * radius
     radius, beyond = np.where(little, radius + beyond, radius), np.where(little, 0.0, beyond)
     steps = np.ceil(beyond / (0.5 * SPACING * radius)).astype(np.intp)
-    # Each part is there at steps + 1 places, from one end of its spread to the other.
+    # Each part is repeated at steps + 1 places, from one end of its spread to the other.
     counts = steps.reshape(-1) + 1
     part = np.repeat(np.arange(len(counts)), counts)
     number = np.arange(len(part)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -177,7 +177,7 @@ def _parts(body: Body) -> tuple[Index, Array, Array]:
 
 
 def _radius(probability: float) -> float:
-    """Length that a vector of three standard normal numbers does not exceed, with a probability.
+    """Return the quantile of the length of a vector of three standard normal numbers.
 
     P(x) = sqrt(2 / pi) exp(-x^2 / 2) sum_k x^(2 k + 3) / (1 3 5 ... (2 k + 3))
     """

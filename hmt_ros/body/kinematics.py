@@ -1,4 +1,4 @@
-"""Forward kinematics, exact Jacobians, and energies over points of the body, of N poses at once.
+"""Forward kinematics, exact Jacobians, and energies over points of the body, for N poses at once.
 
 `core/residuals.h` describes how derivatives over points become those over poses.
 """
@@ -31,7 +31,7 @@ class Frames:
 
     Attributes:
         skeleton: the skeleton.
-        poses: (N, d) whose frames they are.
+        poses: (N, d) poses of the frames.
         segments: columns (N, S, 3, 3) and origins (N, S, 3): columns[n, s, i] is the i-th axis of
             segment s.
         dofs: unit vectors of the degrees of freedom, and points on the axes of rotations,
@@ -69,7 +69,7 @@ class Frames:
         return _poses_last(self.dofs[1])
 
     def points(self, segments: Index, local: Array) -> Array:
-        """Points given in segment frames, in the camera frame.
+        """Transform points from segment frames to the camera frame.
 
         Args:
             segments: (P,) the segment of each point.
@@ -88,13 +88,13 @@ class Frames:
         return result
 
     def places(self, segments: Index, local: Array) -> Array:
-        """Points (N, P, 3) given in segment frames (P, 3), in the camera frame, pose by pose, m."""
+        """Transform points (P, 3) from segment frames to the camera frame, (N, P, 3) m."""
         columns, origins = self.segments
         turned = product(local[:, None], columns[:, segments])[..., 0, :]
         return np.asarray(origins[:, segments] + turned)
 
     def directions(self, segments: Index, local: Array) -> Array:
-        """Directions given in segment frames (P, 3), in the camera frame, (P, 3, N)."""
+        """Rotate directions (P, 3) from segment frames to the camera frame, (P, 3, N)."""
         result: Array = np.einsum('pixn,pi->pxn', self.columns[segments], local)
         return result
 
@@ -119,7 +119,7 @@ def forward(skeleton: Skeleton, poses: ArrayLike) -> Frames:
     """Frames of all segments for poses (N, d).
 
     Raises:
-        ValueError: poses that do not have d columns or are not finite.
+        ValueError: poses do not have d columns or are not finite.
     """
     q = _checked(skeleton, poses)
     n, s, d = len(q), len(skeleton.parents), skeleton.dimension
@@ -142,10 +142,10 @@ def joint_positions(skeleton: Skeleton, poses: ArrayLike, *, relative: bool = Fa
 def point_positions(
     skeleton: Skeleton, poses: ArrayLike, segments: Index, local: Array, *, relative: bool = False
 ) -> Array:
-    """Positions (N, P, 3) of points on segments (P,) at places there (P, 3) at poses (N, d), m.
+    """Return positions (N, P, 3) of points, local (P, 3) on segments (P,), at poses (N, d), m.
 
     Args:
-        relative: to the first point, instead of in the camera frame.
+        relative: whether positions are relative to the first point instead of the camera.
 
     Raises:
         ValueError: as `forward`.
@@ -185,11 +185,11 @@ def point_jacobians(frames: Frames, segments: Index, points: Array) -> Array:
 def directed_derivatives(
     frames: Frames, segments: Index, points: Array, directions: Array
 ) -> Array:
-    """How far points move in given directions with each degree of freedom.
+    """Return derivatives of points along given directions for each degree of freedom.
 
     Args:
-        frames: of one pose.
-        segments: (M,) that carry the points.
+        frames: frames of one pose.
+        segments: (M,) segments of the points.
         points, directions: (M, 3) camera frame.
 
     Returns:
@@ -232,11 +232,11 @@ def joint_length_jacobians(skeleton: Skeleton, poses: ArrayLike) -> Array:
 def point_energy(
     frames: Frames, segments: Index, local: Array, targets: Array, across: Array
 ) -> tuple[Array, Array, Array]:
-    """Energy 1/2 sum |A (p - t)|^2 of points p that should be at targets t.
+    """Return the energy 1/2 sum |A (p - t)|^2 of points p with targets t.
 
     Args:
-        frames: of N poses.
-        segments: (P,) that carry the points.
+        frames: frames of N poses.
+        segments: (P,) segments of the points.
         local: (P, 3) places in the frames of the segments, m.
         targets: (N, P, 3) camera frame, m.
         across: (N, P, R, 3) A, such as the projection across a ray over a deviation, 1/m.
@@ -254,11 +254,11 @@ def point_energy(
 
 
 class Placing(NamedTuple):
-    """The skeleton as compiled code places it.
+    """The skeleton, for the placement in compiled code.
 
     Attributes:
         parents: (S,) segment above; -1: none.
-        first_dofs: (S + 1,) the degrees of freedom of segment s start here.
+        first_dofs: (S + 1,) index of the first degree of freedom of each segment.
         dof_axes, dof_is_rotation: (d,).
         mounts, offsets: (S, 3, 3), (S, 3) of the segments on their parents.
     """
@@ -286,7 +286,7 @@ def placing_of(skeleton: Skeleton) -> Placing:
 
 
 class Tree(NamedTuple):
-    """The skeleton as the compiled code reads it.
+    """The tree of the degrees of freedom, for compiled code.
 
     Attributes:
         parents: (S,) segment above; -1: none.

@@ -1,16 +1,16 @@
-"""Files of learned models: one .npz of plain arrays, which is checked by use when it is read.
+"""Files of learned models: one .npz of plain arrays, tested with an example on reading.
 
 An archive names its format, the version of the format and the kind of model. It holds the
 constructor's parameters as JSON and the learned arrays. A model inside another one keeps its
-arrays under a prefix: `nested` and `part`. A whole file has besides
+arrays under a prefix: `nested` and `part`. A complete file also has
 
 - `card`: what the model was learned from, under which licence, and how; JSON,
-- `checksum`: SHA-256 of all other arrays, which tells damage from a model that is wrong,
+- `checksum`: SHA-256 of all other arrays, which separates damaged files from wrong models,
 - `example/input` and `example/answer`: an input, and what the model predicts for it.
 
-A reader makes the model, whose own code checks shapes and ranges; the arrays that it would write
-must have the names, types and shapes of those of the file; and it must answer for the stored input,
-by a mixture of finite means and positive definite covariances, as when it was written.
+A reader builds the model, whose own code checks shapes and ranges. The arrays that the model would
+write must have the names, types and shapes of those in the file. For the stored input, the model
+must give the stored answer, a mixture of finite means and positive definite covariances.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ MOST_VALUES, LONGEST_TEXT = 20_000_000, 2**20
 LARGEST_FILE = 8 * MOST_VALUES
 # Maximum number of inputs or outputs of a model; a descriptor has a few hundred, a pose forty.
 MOST_NUMBERS = 10_000
-# Ranges of positive numbers and of variances, and the largest ratio of variances. Products of a
-# few of them are finite, and sums of covariances keep what the least adds.
+# Ranges of positive numbers and of variances, and the largest ratio of variances: products of a few
+# of them stay finite, and sums of covariances do not round off the smallest.
 LEAST, LARGEST = 1e-15, 1e30
 LEAST_VARIANCE, LARGEST_VARIANCE, LARGEST_RATIO = 1e-25, 1e12, 1e13
-# Least eigenvalue of a correlation matrix of which Cholesky factors are taken.
+# Minimum eigenvalue of a correlation matrix for its Cholesky factor.
 LEAST_EIGENVALUE = 1e-13
-# Difference of an answer from the stored one, in standard deviations and in nats per variable.
-# Networks compute in single precision: that of another machine explains 1e-5.
+# Maximum difference of an answer from the stored one, in standard deviations and in nats per
+# variable. Networks compute in single precision, which differs by up to 1e-5 between machines.
 TOLERANCE = 1e-3
-# The exceptions that wrong arrays cause wherever they are used.
+# Exceptions that wrong arrays cause anywhere.
 FAULTS = (
     OSError,
     LookupError,
@@ -74,13 +74,13 @@ _INPUT, _ANSWER = 'example/input', 'example/answer'
 
 
 class LearnedModel(Protocol):
-    """What a file asks of a model."""
+    """Interface of a model that a file can hold."""
 
     def to_arrays(self) -> Arrays:
         """The header and the learned arrays."""
 
     def answer(self, given: Array) -> GaussianMixture:
-        """What the model predicts for an input."""
+        """Return the prediction of the model for an input."""
 
 
 Model = TypeVar('Model', bound=LearnedModel)
@@ -88,9 +88,9 @@ Model = TypeVar('Model', bound=LearnedModel)
 
 @contextmanager
 def named_faults(where: str) -> Iterator[None]:
-    """Makes every exception that wrong arrays cause a ValueError of one line, with a path.
+    """Convert exceptions caused by wrong arrays to a ValueError of one line, with a path.
 
-    It repeats the texts of ValueErrors alone, which have no content of the file.
+    Only the texts of ValueErrors are repeated, as these never contain content of the file.
     """
     try:
         with np.errstate(all='ignore'):
@@ -103,7 +103,7 @@ def named_faults(where: str) -> Iterator[None]:
 
 
 def require(condition: object, what: str) -> None:
-    """Raises ValueError, which says what is wrong, unless a condition holds."""
+    """Raise ValueError with the given message unless the condition is true."""
     if not condition:
         raise ValueError(what)
 
@@ -112,7 +112,7 @@ def header(kind: str, parameters: Mapping[str, Any]) -> Arrays:
     """The arrays that identify an archive.
 
     Args:
-        parameters: Constructor's parameters; JSON must be able to hold them.
+        parameters: Constructor's parameters, serialisable as JSON.
     """
     return {
         'format': np.array(FORMAT),
@@ -123,7 +123,7 @@ def header(kind: str, parameters: Mapping[str, Any]) -> Arrays:
 
 
 def check_header(arrays: Mapping[str, NDArray[Any]], kind: str) -> None:
-    """Raises ValueError unless the arrays are those of `header`, for models of a kind."""
+    """Raise ValueError unless the arrays have the header of a model of a kind."""
     single = [name for name in _HEADER if name in arrays and not arrays[name].ndim]
     found = {name: str(arrays[name]) for name in single}
     require(found.get('format') == FORMAT, 'it is none of hmt_ros')
@@ -135,7 +135,7 @@ def parameters_of(arrays: Mapping[str, NDArray[Any]], name: str = 'parameters') 
     """The constructor's parameters in an archive, or its card.
 
     Raises:
-        ValueError: they are no JSON of a mapping.
+        ValueError: the text is not a mapping in JSON.
     """
     result = json.loads(str(arrays[name]))
     require(isinstance(result, dict), f'{name} are no mapping')
@@ -143,17 +143,17 @@ def parameters_of(arrays: Mapping[str, NDArray[Any]], name: str = 'parameters') 
 
 
 def body_of(parameters: Mapping[str, Any]) -> Body:
-    """The body that ships under the name in a file, which must not lead to other files.
+    """Load the shipped body named in a file; the name must not open other files.
 
     Raises:
-        ValueError: none ships under this name.
+        ValueError: no body ships under this name.
     """
     require(parameters['body'] in model_names(), 'it is for a body that does not ship: give it')
     return load_body(parameters['body'])
 
 
 def check_positive(name: str, values: Any) -> None:
-    """Raises ValueError if numbers are not positive, or so small or large that none are."""
+    """Raise ValueError if numbers are not positive or are out of range."""
     require(
         np.min(values) >= LEAST and np.max(values) <= LARGEST,
         f'{name} must be positive, from {LEAST:g} to {LARGEST:g}',
@@ -164,7 +164,7 @@ def check_covariances(name: str, values: Array, slack: float = -LEAST_EIGENVALUE
     """Checks covariances (..., D, D).
 
     Args:
-        slack: added to the eigenvalues of the correlations; above 0, they may be semidefinite.
+        slack: added to the eigenvalues of the correlations; above 0 it allows semidefinite ones.
 
     Raises:
         ValueError: they are not symmetric and positive definite, or variances are out of range.
@@ -189,12 +189,12 @@ def write_model(
     card: Mapping[str, Any],
     example: Array,
 ) -> Path:
-    """Writes a model that can be read again completely, or not at all.
+    """Write a model completely or not at all, after checking that it can be read.
 
     Args:
         path: File to write; '.npz' is appended where it is missing.
-        read: makes the model from its arrays.
-        card: what it was learned from, licence, method; JSON must be able to hold it.
+        read: builds the model from its arrays. card: training data, licence and method,
+        serialisable as JSON.
         example: an input, for `LearnedModel.answer`.
 
     Returns:
@@ -207,7 +207,7 @@ def write_model(
     whole = {**card, 'numbers': sum(values.size for values in arrays.values())}
     arrays |= {'card': np.array(json.dumps(whole, sort_keys=True)), _INPUT: example}
     with named_faults(str(path)):
-        # In the precision of the file, as a reader computes it.
+        # The answer of a model in the precision of the file.
         arrays[_ANSWER] = _answer(read(arrays), arrays)
         arrays['checksum'] = np.array(checksum(arrays))
         checked_model(arrays, read)
@@ -215,14 +215,14 @@ def write_model(
 
 
 def read_model(path: str | Path, kind: str, read: Callable[[Arrays], Model]) -> Model:
-    """The model in a file.
+    """Read the model in a file.
 
     Args:
         read: makes the model from its arrays.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is none of this format, version and kind, or damaged, or wrong.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file has another format, version or kind, or is damaged or invalid.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f'{path}: no such model file; train or learn one')
@@ -233,7 +233,7 @@ def read_model(path: str | Path, kind: str, read: Callable[[Arrays], Model]) -> 
 
 
 def checked_model(arrays: Arrays, read: Callable[[Arrays], Model]) -> Model:
-    """The model of the arrays of a whole file.
+    """Build the model from the arrays of a complete file, and check it.
 
     Raises:
         Exception: the arrays are damaged or wrong; some of `FAULTS`.
@@ -267,7 +267,7 @@ def checksum(arrays: Mapping[str, NDArray[Any]]) -> str:
 
 
 def _answer(model: LearnedModel, arrays: Arrays) -> Array:
-    """What a model says for the stored input: mean, deviations (D,) and log density at the mean."""
+    """Return mean, deviations (D,) and log density at the mean of the answer to the example."""
     found = model.answer(arrays[_INPUT])
     require(abs(found.weights.sum() - 1.0) < TOLERANCE, 'its weights do not sum to 1')
     check_covariances('its answer', found.covariances)
@@ -277,7 +277,7 @@ def _answer(model: LearnedModel, arrays: Arrays) -> Array:
 
 
 def _check_values(arrays: Arrays) -> None:
-    """Raises ValueError for types that models do not have, and numbers that are none."""
+    """Raise ValueError for wrong types of arrays and for numbers that are out of range."""
     size = sum(values.size for values in arrays.values())
     require(size <= MOST_VALUES, f'it has more than {MOST_VALUES} numbers')
     for name, values in arrays.items():

@@ -1,13 +1,13 @@
-"""Poses that follow joint positions, in closed form and frame by frame: the start of retargeting.
+"""Poses from joint positions, in closed form and frame by frame, to initialise retargeting.
 
-The descending solution of KJS 3, from the trunk outwards: with v the direction against a segment,
-seen from its frame before its rotations,
+The solution of KJS 3 descends from the trunk outwards. With v the direction from the end of a
+segment to its start, in the segment's frame before its rotations,
 
     v = (sin b, -sin a cos b, cos a cos b)
 
-gives the first two angles, whatever the lengths. The third, the twist, shows in the next segments;
-where these are straight, in neighbouring frames. The result lies within the limits, and is exact
-for a body of the same lengths that can take the pose; for others it is near.
+gives the first two angles, independent of the lengths. The third angle, the twist, follows from the
+next segments or, if these are straight, from neighbouring frames. The result lies within the
+limits. It is exact for a body of the same lengths that can reach the pose, else approximate.
 """
 
 from __future__ import annotations
@@ -28,21 +28,20 @@ ARM = ('shoulder', 'elbow', 'wrist', 'hand')
 LEG = ('hip', 'knee', 'ankle', 'toe')
 # Weights of the cues for the twist of a limb; a hinge bent by a right angle has weight 1.
 FOOT = 0.3  # a foot, for its leg
-AROUND, AROUND_TIME = 0.2, 0.2  # the frames around; standard deviation of their distance, s
-REST = 1e-3  # no twist
+AROUND, AROUND_TIME = 0.2, 0.2  # neighbouring frames; standard deviation of their time, s
+REST = 1e-3  # zero twist
 HIPS = ('pelvis', 'left_hip', 'right_hip')
 TRUNK_START = 'start of the trunk'
 FLEXIBLE = 0.05  # weight of neck and shoulders for the root of a body whose trunk can bend
 
 
 def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float | None) -> Array:
-    """Poses (T, d) that follow joints by their standard names, (T, 3) each, camera frame, m.
+    """Return poses (T, d) that follow joint positions by standard names.
 
     Args:
-        skeleton: with the limbs of KJS fig. 3, such as those of the bodies that ship.
-        place: positions of the joints; toes and hands may be missing.
-        fps: frames per second, of which headings go on beyond half a turn; None: poses that have
-            nothing to do with one another.
+        skeleton: skeleton with the limbs of KJS fig. 3, such as those of the shipped bodies.
+        place: positions (T, 3) of each joint, camera frame, m; toes and hands may be missing.
+        fps: frames per second of a sequence, whose headings are unwrapped; None: independent poses.
 
     Raises:
         ValueError: the skeleton has other limbs.
@@ -83,9 +82,9 @@ def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float | Non
 
 
 def trunk_start(skeleton: Skeleton, place: Mapping[str, Array]) -> Array:
-    """Where the trunk of a person starts, (T, 3), by the pelvis and the hips.
+    """Return the start of the trunk (T, 3), from the pelvis and the hips.
 
-    It lies as far before the pelvis, relative to the hips below, as at rest.
+    Its offset from the pelvis, relative to the drop of the hips, is that of the rest pose.
     """
     if 'neck' not in skeleton.chains:
         return place['pelvis']
@@ -115,7 +114,7 @@ Aim = tuple[str, str, str]
 
 
 def _aims(skeleton: Skeleton) -> dict[int, Aim]:
-    """For segments that aim at a joint: the joints at its start, its end, the next one's end."""
+    """Return the joints at the start, the end and the next segment's end of aimed segments."""
     result: dict[int, Aim] = {}
     try:
         head = skeleton.chains['neck'][0]
@@ -137,7 +136,7 @@ def _aims(skeleton: Skeleton) -> dict[int, Aim]:
 
 
 def _set_root(skeleton: Skeleton, place: Mapping[str, Array], poses: Array) -> Array:
-    """Sets the root's degrees of freedom from the joints of the trunk; returns its rotation."""
+    """Set the root's degrees of freedom from the joints of the trunk; return its rotation."""
     rotations = root_rotation_dofs(skeleton)
     shifts = skeleton.dof_index(('root_tx', 'root_ty', 'root_tz'))
     flexible = bool(skeleton.moves[skeleton.chains['neck'][0]].sum() > 8)  # root and neck have 8
@@ -157,7 +156,7 @@ def _set_root(skeleton: Skeleton, place: Mapping[str, Array], poses: Array) -> A
 
 
 def _aligned(rest: Array, seen: Array, weights: Array) -> Array:
-    """Rotations (T, 3, 3) that best take points (P, 3) to (T, P, 3) about their weighted means."""
+    """Return rotations (T, 3, 3) that best align points (P, 3) with (T, P, 3), about the means."""
     w = weights / weights.sum()
     a, b = rest - product(w, rest), seen - np.einsum('p,tpi->ti', w, seen)[:, None]
     u, _, vt = singular_values(np.einsum('tpi,p,pj->tij', b, w, a))
@@ -167,7 +166,7 @@ def _aligned(rest: Array, seen: Array, weights: Array) -> Array:
 
 
 def _smoothed(values: Array, sigma: float) -> Array:
-    """Means of values (T, n) over time with Gaussian weights; the ends go on as they are."""
+    """Smooth values (T, n) over time with Gaussian weights; the ends are extended constantly."""
     reach = int(4.0 * sigma + 0.5)
     weights = elementary.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     weights /= weights.sum()
@@ -184,10 +183,10 @@ def _twist(
     next_end: str,
     fps: float | None,
 ) -> Array:
-    """The third angle of a spherical joint, from the next segments.
+    """Return the third angle of a spherical joint, from the next segments.
 
-    The hinge of a limb shows it as far as it is bent; a foot shows it where the leg is straight;
-    elsewhere the twist is that of the frames around. For the trunk it is the line of the shoulders.
+    A bent hinge of a limb determines it; so does a foot if the leg is straight; else the twist is
+    that of neighbouring frames. For the trunk the line of the shoulders determines it.
     """
     if not next_end:
         line = _local(turn, place['right_shoulder'] - place['left_shoulder'])
@@ -228,7 +227,7 @@ def _turned(skeleton: Skeleton, dofs: Sequence[int], poses: Array, turn: Array) 
 
 
 def _within(poses: Array, skeleton: Skeleton) -> Array:
-    """The poses with angles brought into the limits by whole turns, else to the nearer limit."""
+    """Bring angles of poses into the limits by whole turns, else clip them."""
     poses = poses.copy()
     lower, upper = skeleton.lower, skeleton.upper
     for i in np.flatnonzero(skeleton.dof_is_rotation):

@@ -1,13 +1,13 @@
-"""Mirror images of poses: left for right, and the reversal in depth that silhouettes do not show.
+"""Mirror images of poses: left for right, and the reversal in depth, invisible in silhouettes.
 
-A body is its own mirror image, left for right. Mirrored in the plane through the pelvis across the
-line of sight it has, apart from perspective, the same silhouette: a person who approaches looks
-like one who walks away. The joint angles of that pose are those of the mirrored body, so that they
-lie within the limits, too.
+A body is symmetric, left for right. Mirrored in the plane through the pelvis across the line of
+sight, it has the same silhouette, apart from perspective: a person who approaches looks like one
+who walks away. The joint angles of that pose are those of the mirrored body, so they lie within the
+limits, too.
 
-Angles without limits are the same after a whole turn. A person who turns about passes the angle at
-which it is cut, and of two estimates of one heading one may be a turn ahead. A comparison of poses
-by their variables has to take turns out first.
+Angles without limits are equal modulo a whole turn. The heading of a turning person passes the cut,
+and two estimates of one heading may differ by a turn. Whole turns must be removed before poses are
+compared by their variables.
 """
 
 from __future__ import annotations
@@ -28,13 +28,12 @@ from hmt_ros.inference.mixture import GaussianMixture
 
 arctan2 = elementary.arctan2
 
-# A person whose front is turned away from the image plane by less than this is seen from the side,
-# as sine of the angle.
+# Sine of the angle between a person's front and the image plane below which it is a side view.
 SIDEWAYS = 0.12
 # Axes of the root's rotations, in the order in which they act.
 ROOT_AXES = 'zyx'
 TURN = 2.0 * np.pi
-# Share of their limits below which the angles of a root are far from them and from the poles.
+# Ratio of root angles to their limits below which they are clear of limits and poles.
 CLEAR = 0.85
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -59,11 +58,11 @@ def reverse_depth(body: Body, poses: ArrayLike) -> Array:
     """Poses (N, d) mirrored in the plane through the pelvis across the line of sight.
 
     Args:
-        body: whose root turns about z, y and x.
-        poses: (N, d) with the pelvis before the camera.
+        body: body whose root turns about z, y and x.
+        poses: (N, d) poses with the pelvis in front of the camera.
 
     Raises:
-        ValueError: a body with another root.
+        ValueError: the root of the body has other rotations.
     """
     q = np.array(poses, dtype=np.float64, ndmin=2)
     skeleton = body.skeleton
@@ -121,18 +120,18 @@ def root_angles(body: Body, rotations: Array) -> Array:
 def turned(
     body: Body, poses: Array, to: Body, rotation: Array | None = None, turn: float = 0.0
 ) -> Array:
-    """Poses (N, d) whose roots are turned, of a body that may have another level.
+    """Rotate the roots of poses (N, d), for a body that may have another level.
 
     Args:
-        body: of the poses.
+        body: body of the poses.
         poses: (N, d).
-        to: the same body, of the result.
-        rotation: (3, 3) by which the roots are turned, camera frame; None: not at all.
-        turn: angle about z by which the roots have turned before, up to whole turns, rad.
+        to: the same body, for the result.
+        rotation: (3, 3) rotation of the roots, camera frame; None for no rotation.
+        turn: approximate rotation about z, which selects the whole turns of the result, rad.
     """
     root, rotations = root_rotation_dofs(body.skeleton), root_rotations(body, poses)
     angles = root_angles(to, rotations if rotation is None else product(rotation, rotations))
-    # The turn nearest to that of before.
+    # Select the whole turns nearest to the previous angle.
     offset_of_turns = poses[:, root[0]] + turn - angles[:, 0]
     angles[:, 0] += TURN * np.round(offset_of_turns / TURN)
     result = poses.copy()
@@ -157,7 +156,7 @@ def turn_jacobians(
 
 
 def relevelled(body: Body, mixture: GaussianMixture, to: Body) -> GaussianMixture:
-    """A mixture over poses of a body, as one over poses of the same body with another level."""
+    """Convert a mixture over poses to one for the same body with another level."""
     if np.array_equal(body.level, to.level):
         return mixture
     means = turned(body, mixture.means, to)
@@ -167,9 +166,9 @@ def relevelled(body: Body, mixture: GaussianMixture, to: Body) -> GaussianMixtur
 
 
 def clear_level(body: Body, pose: Array) -> Array:
-    """The level (3, 3) at which the root angles of a pose (d,) are far from their limits.
+    """Return a level (3, 3) with the root angles of a pose (d,) far from their limits.
 
-    It is that of the body where they are, else turned about the optical axis by quarter turns.
+    It is the level of the body if they are, else this level rotated by quarter turns.
     """
     best, least = body.level, CLEAR
     if not {*ROOT_ANGLES} <= {*body.dof_names}:
@@ -194,7 +193,7 @@ def propagated(jacobians: Array, covariances: Array) -> Array:
 
 
 class Trunk(NamedTuple):
-    """The joints (L,) of the trunk on its left, and those on its right, for the core."""
+    """The left and the right joints (L,) of the trunk, for the core."""
 
     left: Index
     right: Index
@@ -202,7 +201,7 @@ class Trunk(NamedTuple):
 
 @lru_cache(maxsize=16)
 def trunk_of(body: Body) -> Trunk:
-    """The trunk, which tells where a person faces.
+    """Return the trunk joints, which show where a person faces.
 
     Raises:
         ValueError: a body without shoulders and hips.
@@ -224,10 +223,10 @@ def left_directions(body: Body, poses: Array) -> Array:
 
 
 def faces_back(body: Body, joints: Array, reference: Array) -> Mask:
-    """Whether persons with joints (N, J, 3) face another way than one with joints (J, 3).
+    """Whether persons with joints (N, J, 3) face another way than a reference (J, 3).
 
-    They face away from it, or one faces the camera where the other turns its back: a turn, seen
-    from the side, may go either way on.
+    They face away from the reference, or one faces the camera while the other turns its back: in a
+    side view, a turn may continue either way.
 
     Raises:
         ValueError: a body without shoulders and hips.
@@ -239,22 +238,22 @@ def faces_back(body: Body, joints: Array, reference: Array) -> Mask:
 
 
 def endless(body: Body) -> Mask:
-    """The variables (d,) that are angles and go round: their limits are a turn apart, or more."""
+    """Return which variables (d,) are angles whose limits are at least a whole turn apart."""
     return np.asarray(body.skeleton.dof_is_rotation & (body.upper - body.lower >= TURN))
 
 
 def free_limits(body: Body) -> tuple[Array, Array]:
-    """Limits (d,) of poses in any frame: the place and the turns of the root have none."""
+    """Return limits (d,) of poses in any frame; root position and full turns are unlimited."""
     free = endless(body)
     free[:3] = True
     return np.where(free, -np.inf, body.lower), np.where(free, np.inf, body.upper)
 
 
 def without_turns(body: Body, poses: Array, before: Array) -> Array:
-    """Poses (K, d) whose angles are within half a turn of the nearest pose before (L, d).
+    """Shift angles of poses (K, d) to within half a turn of the nearest pose `before` (L, d).
 
-    The nearest one is that whose joints, relative to the first, are nearest in the mean: joints do
-    not change with whole turns.
+    The nearest pose has the least mean distance of joints relative to the first joint, which do not
+    depend on whole turns.
     """
     joints, known = (body.relative_joints(x) for x in (poses, before))
     apart = joints[:, None] - known

@@ -1,12 +1,12 @@
-"""Bodies from YAML model files; the format is explained in `models/human37.yaml`.
+"""Bodies from YAML model files; `models/human37.yaml` explains the format.
 
-Lengths vary over people by a common stature, and by proportions of their own:
+Lengths vary over people by a common stature and by individual proportions:
 
     l_i = l0_i exp(s + e_i),    s ~ N(0, t^2),  e_i ~ N(0, p_i^2)
     S_l = L0 (t^2 1 1' + diag(p^2)) L0,    L0 = diag(l0)
 
-to first order in the spreads. t is the spread of the stature, p_i that of the proportion of a
-length. Measurements of a person fix linear functions of the lengths, H l, with the covariance R:
+to first order in the spreads. t is the spread of the stature, p_i the spread of the proportion of
+length i. Measurements of a person fix linear functions of the lengths, H l, with the covariance R:
 
     S_l <- S_l - S_l H' (H S_l H' + R)^-1 H S_l
 """
@@ -54,22 +54,22 @@ def model_names() -> list[str]:
 
 
 def shipped_file(body: str, kind: str) -> Path | None:
-    """What ships for a body, 'prior' or 'motion'; None: nothing.
+    """Return the shipped file of a body, of kind 'prior' or 'motion', or None if there is none.
 
-    Names come with messages, too, and must not lead to other files.
+    Names may come from messages, so they must not open other files.
     """
     file = Path(__file__).parent / 'models' / f'{body}_{kind}.npz'
     return file if body in model_names() and file.is_file() else None
 
 
 def load_body(source: str | Path) -> Body:
-    """The body of a YAML file, or of a name that ships: 'human37', 'human34' or 'human32'.
+    """Load a body from a YAML file, or by a shipped name: 'human37', 'human34' or 'human32'.
 
-    That of a motion file is read by `hmt_learning.motion.motion_file.read_skeleton`.
+    `hmt_learning.motion.motion_file.read_skeleton` reads the skeleton of a motion file.
 
     Raises:
         FileNotFoundError: neither a file nor a known name.
-        ValueError: a file that is not a body; the message names the file and the entry.
+        ValueError: the file is not a body; the message names the file and the entry.
     """
     try:
         with np.errstate(all='ignore'):  # a body whose numbers overflow is refused
@@ -87,10 +87,10 @@ def load_body(source: str | Path) -> Body:
 
 
 def named_body(name: str) -> Body:
-    """The body that ships under a name; for names in messages, which must not lead to files.
+    """Return a shipped body by name; for names in messages, which must not open files.
 
     Raises:
-        FileNotFoundError: none ships under this name.
+        FileNotFoundError: no body ships under this name.
     """
     known = model_names()
     if name not in known:
@@ -100,12 +100,12 @@ def named_body(name: str) -> Body:
 
 @cache
 def _built(name: str) -> Body:
-    """A body that ships; cached, as each change of the lengths in messages asks for it."""
+    """Return a shipped body; cached, because each message with new lengths needs it."""
     return load_body(name)
 
 
 def _read(source: str | Path) -> dict[str, Any]:
-    """The content of a model file, with that of the model it extends."""
+    """Read a model file, merged with the model that it extends."""
     if str(source) in model_names():
         return deepcopy(_shipped(str(source)))
     path = Path(source)
@@ -118,30 +118,30 @@ def _read(source: str | Path) -> dict[str, Any]:
 
 @cache
 def _shipped(name: str) -> dict[str, Any]:
-    """The content of a model that ships; cached, as reading takes 50 ms."""
+    """Read a shipped model file; cached, because reading takes 50 ms."""
     file = resources.files('hmt_ros.body') / 'models' / f'{name}.yaml'
     return _whole(load_plain_yaml(file.read_text('utf-8')))
 
 
 def usual_symmetries() -> Mapping[str, float]:
-    """The table of human37, which bodies without one of their own have."""
+    """Return the symmetries of human37, the default of bodies without a table of their own."""
     result: Mapping[str, float] = _shipped('human37')['symmetries']
     return result
 
 
 def usual_postures() -> Mapping[str, Mapping[str, Any]]:
-    """The table of human37, see `body.postures`; other bodies have what they share with it."""
+    """Return the postures of human37, see `body.postures`; other bodies use shared entries."""
     result: Mapping[str, Mapping[str, Any]] = _shipped('human37')['postures']
     return result
 
 
 def joint_errors_of(joint_names: Sequence[str], table: Mapping[str, float] | None = None) -> Array:
-    """Errors (J,) of joints, m: of the joints of a table, or that of human37; see `Body`.
+    """Return the errors (J,) of joints, m, from a table or else from human37; see `Body`.
 
-    A joint that the table does not have errs as the worst of those that it has.
+    A joint that the table lacks gets the largest error in the table.
 
     Raises:
-        ValueError: a table with other entries than numbers of at least 0, of joints of the body.
+        ValueError: an entry is negative or not finite, or names a joint that the body lacks.
     """
     known = _shipped('human37')['joint_errors'] if table is None else table
     errors = {joint: float(error) for name, error in known.items() for joint, _ in _sides(name)}
@@ -154,7 +154,7 @@ def joint_errors_of(joint_names: Sequence[str], table: Mapping[str, float] | Non
 
 
 def _whole(content: Any) -> dict[str, Any]:
-    """The content of a model with that of the one that ships and that it extends."""
+    """Merge the content of a model with the shipped model that it extends."""
     if not isinstance(content, dict):
         raise ValueError(f'wanted a mapping, saw {type(content).__name__}')
     if 'extends' in content:
@@ -168,13 +168,13 @@ def _whole(content: Any) -> dict[str, Any]:
 
 
 def _sides(template: str) -> list[tuple[str, str]]:
-    """Names that a template stands for, each with its side; without a side, as on the right."""
+    """Expand a template to names and their sides; a name without a side counts as right."""
     sides = ('left', 'right') if '{side}' in template else ('right',)
     return [(template.replace('{side}', side), side) for side in sides]
 
 
 def _linear(term: Any, names: tuple[str, ...]) -> tuple[float, Array]:
-    """A number, or 'factor * length', as constant and coefficients over the lengths."""
+    """Parse a number, or 'factor * length', to a constant and coefficients over the lengths."""
     coefficients = np.zeros(len(names))
     if isinstance(term, (int, float)):
         return float(term), coefficients
@@ -186,7 +186,7 @@ def _linear(term: Any, names: tuple[str, ...]) -> tuple[float, Array]:
 
 
 def _mount(entry: dict[str, Any]) -> Array:
-    """Rotation whose negative z axis points where the segment points, with the x axis as given."""
+    """Return the rotation with the given x axis and -z along the segment."""
     x = np.array(entry.get('x_axis', [1, 0, 0]), dtype=float)
     down = np.array(entry.get('points', [0, 0, -1]), dtype=float)
     x /= length(x)
@@ -364,7 +364,7 @@ def _dof(entry: list[Any], mirrored: bool) -> tuple[int, bool, float, float, flo
     unit = np.pi / 180 if is_rotation else 1.0
     low, high, *prior = (float(x) * unit for x in numbers)
     mean, sigma = prior or (0.0, np.inf)
-    # A mirror turns the sense of rotations about y and z, and of translations along x.
+    # A mirror reverses rotations about y and z, and translations along x.
     if mirrored and is_rotation == (axis != 0):
         low, high, mean = -high, -low, -mean
     return axis, is_rotation, low, high, mean, sigma
@@ -408,7 +408,7 @@ def _shape(
     )
 
 
-# Relative standard deviation of the stature over people, where a model file gives none.
+# Default relative standard deviation of the stature over people.
 STATURE_SPREAD = 0.06
 
 
@@ -418,12 +418,12 @@ def length_covariance(
     """Covariance (L, L) of lengths over people, m^2.
 
     Args:
-        lengths: (L,) of the typical person, m.
-        proportions: (L,) relative standard deviations, the stature apart.
-        stature: relative standard deviation of the stature.
+        lengths: (L,) lengths of the typical person, m.
+        proportions: (L,) relative standard deviations of the proportions.
+        stature: relative standard deviation of the common stature.
 
     Raises:
-        ValueError: a spread that is not finite, or negative.
+        ValueError: a spread is negative or not finite.
     """
     typical, own = (np.asarray(x, dtype=np.float64) for x in (lengths, proportions))
     if not 0.0 <= stature < FARTHEST:
@@ -436,12 +436,12 @@ def length_covariance(
 
 
 def held(covariance: Array, functions: ArrayLike, sigma: ArrayLike) -> Array:
-    """Covariance (L, L) of lengths when linear functions of them are known.
+    """Condition the covariance (L, L) of lengths on known linear functions of them.
 
     Args:
-        covariance: (L, L) before.
-        functions: (M, L) rows H.
-        sigma: (M,) standard deviations with which H l are known, more than 0.
+        covariance: (L, L) prior covariance.
+        functions: (M, L) matrix H.
+        sigma: (M,) standard deviations of the known H l, above 0.
     """
     rows = np.asarray(functions, dtype=np.float64)
     noise = np.diag(np.asarray(sigma, dtype=np.float64) ** 2)

@@ -1,8 +1,8 @@
 """The motion prior of a body: one object for the filter, the smoother and the prediction of poses.
 
 For a body with a learned file (`models/<name>_motion.npz`) poses have damped velocities whose
-changes are coupled; without one they walk randomly at the rates of the body's YAML file. The card
-of the shipped file is in `docs/motion_prior.md`, and in the file itself.
+changes are coupled; without one they are random walks with the rates of the body's YAML file. The
+card of the shipped file is in `docs/motion_prior.md`, and in the file itself.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 
 KIND = 'motion_prior'
-INTERVAL = 1.0 / 30.0  # of the example of a file, s
+INTERVAL = 1.0 / 30.0  # interval of the example in a file, s
 
 
 @dataclass(frozen=True, eq=False)
 class LearnedMotion:
-    """A motion prior of the poses of a body that was learned; see `DampedVelocity`.
+    """A learned motion prior of the poses of a body; see `DampedVelocity`.
 
     Attributes:
         body: name of the body.
         dof_names: (d,) names of its degrees of freedom.
         damping: (d,) share of the velocity lost per second.
         diffusion: (d, d) covariance that the velocity gains per second, (m/s)^2 and (rad/s)^2.
-        white: (d,) variance that the pose gains per second besides, m^2 and rad^2.
-        card: data, method and licence; JSON must be able to hold it.
+        white: (d,) additional variance that the pose gains per second, m^2 and rad^2.
+        card: data, method and licence, serialisable as JSON.
 
     Raises:
-        ValueError: values that make no motion prior.
+        ValueError: the values are not a valid motion prior.
     """
 
     body: str
@@ -108,7 +108,7 @@ def motion_prior(body: Body) -> LinearGaussianDynamics:
 
 @cache
 def shipped_motion(name: str) -> LearnedMotion | None:
-    """The motion prior that ships for the body of a name; None: there is none.
+    """The motion prior that ships for the body of a name; None if there is none.
 
     Raises:
         ValueError: the file that ships is damaged.

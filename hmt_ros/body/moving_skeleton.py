@@ -32,7 +32,7 @@ class MovingSkeleton:
     Attributes:
         times: (T,) s, increasing.
         names, parents: (N,) name and parent of each node, which stands before it; -1: the root.
-        offsets: (N, 3) from the parent, in its axes; of the root 0.
+        offsets: (N, 3) from the parent, in its axes, m; 0 for the root.
         rotations: (T, N, 3, 3) from the axes of the node to those of its parent.
         places: (T, 3) of the root.
     """
@@ -51,14 +51,14 @@ class MovingSkeleton:
         """The motion of a body at its present lengths.
 
         Args:
-            body: whose root alone moves along axes.
+            body: body with translations at the root only.
             poses: (T, d).
             times: (T,) s, increasing.
             room: (3, 3) rotation from the frame of the camera to axes with y up.
             height: of the camera in the room, m.
 
         Raises:
-            ValueError: another segment moves along axes, or there are several roots.
+            ValueError: another segment has translations, or there are several roots.
         """
         skeleton = body.skeleton
         moved = skeleton.dof_segments[~skeleton.dof_is_rotation]
@@ -89,7 +89,7 @@ class MovingSkeleton:
         )
 
     def at_rate(self, rate: float) -> MovingSkeleton:
-        """The same at even times, `rate` a second; between its times motions are interpolated.
+        """Resample the motion by interpolation to regular times, `rate` per second.
 
         Raises:
             ValueError: too many times.
@@ -139,7 +139,7 @@ def bvh_text(moving: MovingSkeleton, rate: float) -> str:
 
 
 def _text(values: Array) -> str:
-    # A zero may have a sign, which would be seen.
+    # Remove the sign of negative zeros in the text.
     return ' '.join(f'{x:.6f}' for x in np.round(values, 6) + 0.0)
 
 

@@ -37,7 +37,7 @@ class AnglePrior:
     """The soft prior of the joint angles: an independent Gaussian for each.
 
     Attributes:
-        body: with the means and standard deviations.
+        body: body with the means and standard deviations.
         weight: factor on the energy.
     """
 
@@ -102,7 +102,7 @@ def check_kind(kind: str) -> None:
     """Checks the name of a soft prior.
 
     Raises:
-        ValueError: there is none of this name.
+        ValueError: the kind is unknown.
     """
     if kind not in KINDS:
         raise ValueError(f'pose_prior must be one of {KINDS}, saw {kind!r}')
@@ -118,7 +118,7 @@ def pose_prior(body: Body, kind: str, weight: float) -> AnglePrior | MixturePrio
         weight: factor on the energy.
 
     Raises:
-        ValueError: another kind.
+        ValueError: the kind is unknown.
     """
     check_kind(kind)
     mixture = shipped_prior(body) if kind == LEARNED else None
@@ -135,7 +135,7 @@ def prior_energies(prior: AnglePrior | MixturePrior, poses: Array) -> Energy:
 
 
 class PriorModel(NamedTuple):
-    """The prior as the compiled code reads it.
+    """The prior, for compiled code.
 
     Attributes:
         whitening: (C, n, m) inverse Cholesky factors W of the covariances, lower triangular, in

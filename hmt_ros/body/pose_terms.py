@@ -10,7 +10,7 @@ from hmt_ros.inference.energy import Derivatives, Energy
 
 
 class FrameTerm(Protocol):
-    """An energy term of one's own, which reads a pose through the frames of its segments."""
+    """Interface of a custom energy term that reads a pose through the frames of its segments."""
 
     def energy(
         self, frames: Frames, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
@@ -19,6 +19,6 @@ class FrameTerm(Protocol):
 
         Args:
             rows: (N,) the problem that each pose belongs to, as for `EnergyTerm`.
-            derivatives: by the pose, which are wanted.
+            derivatives: requested derivatives with respect to the pose.
         """
         ...

@@ -1,12 +1,12 @@
-"""How people hold limbs that no image shows: standing, striding, sitting, kneeling.
+"""Postures of limbs that no image shows: standing, striding, sitting, kneeling.
 
     p(x) = sum_c q_c prod_i N(x_i; m_ci, s_ci^2)                    angles i of the limbs
     y_i ~ N(x_i, S_ii + b_i t_i)                                    where a mode says that they are
 
-The modes (y, S) of a tracker say where a limb is that an image shows. Of another one they know less
-and less, as its angles wander at the rates b of the body for the time t since it was seen last, and
-nothing where it never was. Postures are narrow, so that within one a linear map from angles to
-joints is good enough.
+The modes (y, S) of a tracker locate the limbs that an image shows. Their information on a hidden
+limb decays, as its angles diffuse at the rates b of the body for the time t since it was last seen;
+it is zero for a limb that was never seen. Postures are narrow, so within a posture a linear map
+from angles to joints is accurate enough.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import log_sum_exp, product, pseudo_inverse
 from hmt_ros.inference.mixture import GaussianMixture
 
-# Share of the mode's own guess, which goes on from what is seen of the person, where a limb has not
-# been seen for much longer than the time, s; before it is larger. Chosen on clips.
+# Share of the mode's own prediction for a limb that has not been seen for much longer than the time
+# constant, and this constant, s; the share decays from 1. Chosen on clips.
 SUPPOSED, FORGOTTEN = 0.5, 1.0
-# A posture in which a mode has less than this share of all is left out.
+# Minimum weight, over all modes and postures, of a posture that is kept.
 LIGHTEST = 0.006
-# Joints that stay where they are as the pelvis turns.
+# Joints that stay fixed while the pelvis turns.
 TOP = ('neck', 'left_shoulder', 'right_shoulder')
 
 
@@ -37,8 +37,8 @@ class Postures:
     """P postures of a body.
 
     Attributes:
-        body: whose angles.
-        shares: (P,) how often people are in each; they sum to 1.
+        body: body of the angles.
+        shares: (P,) prior probabilities of the postures.
         means, sigmas: (P, d) of the degrees of freedom.
     """
 
@@ -48,11 +48,12 @@ class Postures:
     sigmas: Array
 
     def spread(self, modes: GaussianMixture, unseen: Array) -> tuple[GaussianMixture, Index, Index]:
-        """Modes whose unseen angles spread as people's do.
+        """Spread the unseen angles of modes over postures.
 
         Args:
             modes: K of them over poses (d,).
-            unseen: (d,) time since an image has shown each angle, s; 0: this one does; inf: none.
+            unseen: (d,) time since an image last showed each angle, s; 0: the current image; inf:
+                never.
 
         Returns:
             A component for each mode, and for each posture that it may be in instead, heaviest
@@ -92,7 +93,7 @@ class Postures:
         return GaussianMixture(weights[rows, postures], means, covariances), rows, postures
 
     def _swaying(self, poses: Array, unseen: Array) -> Array:
-        """Covariances (N, d, d) of a pelvis that turns below a trunk that stays where it is.
+        """Return covariances (N, d, d) of a pelvis that turns below a fixed trunk.
 
         The angles between them are the soft prior's, or have wandered for less time than that.
 
@@ -113,7 +114,7 @@ class Postures:
 
 
 def postures_of(body: Body) -> Postures:
-    """The postures of a body; what the table does not name is as the soft prior of the angles."""
+    """Return the postures of a body; angles missing in the table follow their soft prior."""
     names, rows = list(body.dof_names), []
     order, signs = mirror_order(body.skeleton)
     for entry in usual_postures().values():

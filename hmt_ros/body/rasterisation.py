@@ -18,7 +18,7 @@ from hmt_ros.body.flesh import Mesh
 from hmt_ros.body.kinematics import forward
 from hmt_ros.inference.arrays import Array, Index, Mask
 
-STACKS, SLICES = 13, 18  # of the mesh of a part: its outline is right to 2 % of its radius
+STACKS, SLICES = 13, 18  # mesh of a part; its outline is exact to 2 % of its radius
 SMALLEST_AREA = 1e-6  # px^2, of twice a triangle: a smaller one covers the centre of no pixel
 CHUNK = 16  # poses whose silhouettes are drawn together
 
@@ -63,7 +63,7 @@ class Filled:
 
 @lru_cache(maxsize=8)
 def mesh_of(body: Body) -> Mesh:
-    """Triangles of the flesh, the normals of which point outwards."""
+    """Return the triangles of the flesh, with outward normals."""
     if not body.shapes:
         raise ValueError(f'body {body.name} has no flesh: it can not be drawn')
     mesh = body.flesh.mesh(STACKS, SLICES)
@@ -86,7 +86,7 @@ def _field_of_view(camera: Camera) -> Array:
 
 
 def project(mesh: Mesh, points: Array, camera: Camera) -> Triangles:
-    """Triangles that face the camera and may be seen, of vertices (V, 3, N) of N images."""
+    """Return triangles that face the camera and may be visible, for vertices (V, 3, N)."""
     p = np.ascontiguousarray(points.transpose(1, 0, 2))
     (u, v), _ = camera.project_with_derivative(p, derivative=False)
     a, b, c = mesh.triangles.T
@@ -129,12 +129,12 @@ def fill(triangles: Triangles, height: int, width: int) -> Filled:
 
 
 def _first(places: Array, size: int) -> Index:
-    """First whole number from each place on, within an image."""
+    """Return the first integer at or after each place, within an image."""
     return np.clip(np.ceil(places), 0, size).astype(np.intp)
 
 
 def _ranges(start: Index, stop: Index) -> tuple[Index, Index]:
-    """All whole numbers of the ranges [start, stop), and the range that each belongs to."""
+    """Return all integers of the ranges [start, stop), and the range of each."""
     count = np.maximum(stop - start, 0)
     which = np.repeat(np.arange(len(start)), count)
     first = start - (np.cumsum(count) - count)

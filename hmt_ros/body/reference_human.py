@@ -1,7 +1,7 @@
-"""The reference model of a human of REP 155, fitted to joint positions.
+"""The reference human model of REP 155, fitted to joint positions.
 
-Frames: the body has x forward, y to the left, z up, its origin midway between the hips. At zero the
-person stands upright with hanging arms and legs. Joints, parent links and axes are those of
+Frames: the body has x forward, y to the left, z up, its origin midway between the hips. At zero
+angles the person stands upright with hanging arms and legs. Joints, parent links and axes follow
 `human-tpl.xacro` of the package human_description:
 
     body -waist-> waist -(r_torso, y_torso)-> torso      y; then x and z, which are added
@@ -11,9 +11,9 @@ person stands upright with hanging arms and legs. Joints, parent links and axes 
     body -l_y_hip, l_p_hip, l_r_hip-> l_hip              -z, x, -y (right: only x is mirrored)
     l_hip -l_knee-> l_knee -> l_ankle                    -y
 
-The reference has a trunk that only leans forward, and shoulders at a fixed place on it. The four
-added joints let the trunk bend sideways and twist and the shoulders lift, so that the model passes
-through all joint positions; without `additions` there are none.
+The reference has a trunk that only leans forward, with shoulders fixed on it. The four added joints
+let the trunk bend sideways and twist and the shoulders lift, so that the model passes through all
+joint positions; `additions=False` leaves them out.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import length, product
 
-# Joints of the reference with the ranges that it gives them, rad.
+# Joints of the reference and their ranges, rad.
 _LIMB_RANGES = {
     '{}_y_shoulder': (-1.1, 1.9),
     '{}_p_shoulder': (-0.4, 3.3),
@@ -60,11 +60,11 @@ NEEDED = (
         for joint in ('hip', 'knee', 'ankle', 'shoulder', 'elbow', 'wrist')
     ),
 )
-# Sine of the angle below which two bones have one direction, and length that counts as 0, m.
+# Sine of the angle below which two bones are parallel; length below which it counts as 0, m.
 _STRAIGHT, _NOTHING = 1e-4, 1e-3
-# Angle at which the hips lie before the line down from the pelvis joint, rad: that of our bodies.
+# Angle of the hips in front of the vertical through the pelvis joint in our bodies, rad.
 HIPS_AHEAD = elementary.arctan(0.33)
-# Weight of a change of angles from image to image against angles beyond their ranges.
+# Weight of the change of angles between images relative to the excess over their ranges.
 _STEADY = 0.2
 
 
@@ -73,10 +73,10 @@ class Joint:
     """A joint of the model, between two links.
 
     Attributes:
-        name: of the joint, without the identity of the body.
-        parent, child: links.
-        origin: (3,) of the child in the frame of the parent, m.
-        axis: (3,) unit vector; None: the joint is fixed.
+        name: name of the joint, without the body's identifier.
+        parent, child: names of the links.
+        origin: (3,) origin of the child in the frame of the parent, m.
+        axis: (3,) unit vector; None for a fixed joint.
     """
 
     name: str
@@ -91,10 +91,10 @@ class ReferenceHuman:
     """The model of one person in one pose.
 
     Attributes:
-        joints: of the model at the person's lengths, parents before their children.
-        angles: rad, in [-pi, pi), by joint, without the fixed ones.
+        joints: joints of the model at the person's lengths, parents before their children.
+        angles: angle of each movable joint, in [-pi, pi), rad.
         rotation: (3, 3) from the body's frame to that of the joint positions.
-        origin: (3,) of the body, m.
+        origin: (3,) origin of the body, m.
     """
 
     joints: tuple[Joint, ...]
@@ -103,7 +103,7 @@ class ReferenceHuman:
     origin: Array
 
     def links(self) -> tuple[list[str], Array, Array]:
-        """Names (L) of all links but the body, their rotations (L, 3, 3) and origins (L, 3), m.
+        """Return names (L), rotations (L, 3, 3) and origins (L, 3), m, of all links but the body.
 
         Both are in the frame of the body.
         """
@@ -126,22 +126,22 @@ def fit_reference_human(
     *,
     additions: bool = True,
 ) -> ReferenceHuman:
-    """The reference model in the pose that joint positions show.
+    """Fit the reference model to joint positions.
 
-    Of the two sets of angles that a limb may have for one direction, the one that is within the
-    ranges of the reference and near the last one is chosen. Angles that positions do not show keep
-    their last values: the roll of a limb that is straight, the yaw of one that hangs straight down.
-    Positions never show that the head turns: `y_head` is 0.
+    A direction of a limb allows two sets of angles; the set within the ranges of the reference and
+    near the last angles is chosen. Angles that positions do not determine keep their last values:
+    the roll of a straight limb, the yaw of a limb that hangs straight down. Positions never
+    determine the turn of the head: `y_head` is 0.
 
     Args:
-        names: (J) of the joints.
-        positions: (J, 3) m, in any right-handed frame.
-        previous: angles of the image before; None: all zero.
-        additions: whether the model has the joints that the reference does not have. Without them
-            limbs keep their directions, and shoulders are where the reference has them.
+        names: (J) names of the joints.
+        positions: (J, 3) positions in any right-handed frame, m.
+        previous: angles in the previous image; None: all zero.
+        additions: whether the model has the added joints. Without them limbs keep their directions,
+            and the shoulders are at their places in the reference.
 
     Raises:
-        ValueError: a joint that is needed is not there, or two of a bone are at one place.
+        ValueError: a needed joint is missing, or both joints of a bone are at one place.
     """
     missing = [name for name in NEEDED if name not in names]
     if missing:
@@ -151,7 +151,7 @@ def fit_reference_human(
     origin = (at['left_hip'] + at['right_hip']) / 2
     rotation = _body_axes(at, origin)
     in_body = {name: product(rotation.T, place - origin) for name, place in at.items()}
-    # The trunk starts over the middle of the hips, before the pelvis joint.
+    # The trunk starts above the middle of the hips, in front of the pelvis joint.
     in_body['pelvis'] = in_body['pelvis'] * [0.0, 1.0, 1.0]
     angles: dict[str, float] = {}
     torso = _fit_trunk(in_body, angles, additions=additions)
@@ -187,7 +187,7 @@ def _unit(vector: Array, what: str) -> Array:
 
 
 def _body_axes(at: Mapping[str, Array], origin: Array) -> Array:
-    """Columns x forward, y from the right hip to the left, z up along the pelvis."""
+    """Return columns x forward, y from the right hip to the left, z up along the pelvis."""
     y = _direction(at, 'right_hip', 'left_hip')
     up = at['pelvis'] - origin
     up = elementary.cos(HIPS_AHEAD) * up + elementary.sin(HIPS_AHEAD) * np.cross(y, up)
@@ -198,7 +198,7 @@ def _body_axes(at: Mapping[str, Array], origin: Array) -> Array:
 
 
 def _fit_trunk(at: Mapping[str, Array], angles: dict[str, float], *, additions: bool) -> Array:
-    """Angles of the trunk; returns the axes (3, 3) of the torso in the frame of the body."""
+    """Set the angles of the trunk; return the axes (3, 3) of the torso in the body's frame."""
     z = _direction(at, 'pelvis', 'neck')
     if not additions:
         angles['waist'] = float(elementary.arctan2(z[0], z[2]))
@@ -220,7 +220,7 @@ def _fit_arm(
     before: Mapping[str, float],
     angles: dict[str, float],
 ) -> None:
-    """Angles of an arm that hangs on a frame `base` (3, 3).
+    """Set the angles of an arm whose shoulder has the axes `base` (3, 3).
 
     Upper arm: Rz(-s a) Rx(s b) Rz(s c), with s = 1 on the left and -1 on the right.
     """
@@ -246,7 +246,7 @@ def _fit_arm(
 def _fit_leg(
     at: Mapping[str, Array], letter: str, before: Mapping[str, float], angles: dict[str, float]
 ) -> None:
-    """Angles of a leg. Thigh: Rz(-a) Rx(s b) Ry(-c), with s = 1 on the left and -1 on the right."""
+    """Set the angles of a leg; thigh Rz(-a) Rx(s b) Ry(-c), s = 1 on the left, -1 on the right."""
     side, s = SIDES[letter]
     names = [f'{letter}_{axis}_hip' for axis in 'ypr']
     thigh = _direction(at, f'{side}_hip', f'{side}_knee')
@@ -276,7 +276,7 @@ def _fit_leg(
 def _best_angles(
     found: Sequence[tuple[float, ...]], names: Sequence[str], before: Mapping[str, float]
 ) -> tuple[float, ...]:
-    """The best of several sets of angles for one direction, by ranges and last values."""
+    """Choose the best of several sets of angles for one direction, by ranges and last values."""
 
     def cost(each: tuple[float, ...]) -> float:
         terms = zip(each, (RANGES[name] for name in names), names, strict=True)
@@ -296,10 +296,10 @@ def _wrapped(angle: float) -> float:
 def _joints(
     at: Mapping[str, Array], ahead: Mapping[str, float], *, additions: bool
 ) -> tuple[Joint, ...]:
-    """The joints of the model, at the lengths that positions in the frame of the body have.
+    """Return the joints of the model, with the lengths of positions in the body's frame.
 
     Args:
-        ahead: how far the shoulders lie before the neck, by side, m.
+        ahead: distance of the shoulders in front of the neck, by side, m.
     """
 
     def distance(first: str, last: str) -> float:

@@ -1,12 +1,12 @@
 """Points of a body that rest on the ground do not move from one image to the next.
 
-Each point rests or moves, a Markov chain that changes `CHANGES` times a second. How fast it seems
-to move along a trajectory tells which of both,
+Whether a point rests or moves is a Markov chain that switches `CHANGES` times a second. The speed
+of the point along a trajectory is the evidence,
 
     rests: v_across ~ N(0, 0.07^2), v_away ~ N(0, 0.17^2)    moves: N(0, 0.7^2), N(0, 0.6^2)   m/s
 
-across and along the direction in which a point is known least, about the line of sight. Between two
-images a point that rests with probability r costs
+across and along the most uncertain direction of a point, approximately the line of sight. Between
+two images a point that rests with probability r costs
 
     r |p(x_{t+1}) - p(x_t)|^2 / (2 q dt)                      q: what a resting point slips, m^2/s
 
@@ -29,23 +29,23 @@ from hmt_ros.inference.block_tridiagonal import BlockTridiagonal
 from hmt_ros.inference.linear_algebra import product, symmetric_eigen
 from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
 
-# Standard deviations of the speed across and along the direction known least, m/s, of points that
-# rest and of points that move, in trajectories of the smoother; from the feet of the clips.
+# Standard deviations of the speed across and along the most uncertain direction, of resting and of
+# moving points in trajectories of the smoother, m/s; from the feet of the clips.
 RESTS, MOVES = (0.07, 0.17), (0.7, 0.6)
-# How often a point changes between rest and motion, per second.
+# Rate of changes of a point between rest and motion, 1/s.
 CHANGES = 2.0
-# Variance that a resting point slips by, m^2/s: 9 mm in a second.
+# Variance of the slip of a resting point, m^2/s: 9 mm in a second.
 SLIP = 8e-5
-# A point whose probability to rest is lower is left free.
+# Minimum probability of rest of a constrained point.
 LEAST = 1e-3
 
 
 class RestingTable(NamedTuple):
-    """The coordinates R of points that rest along a trajectory, linear in the pose near it.
+    """R linearised coordinates of points that rest along a trajectory.
 
     Attributes:
         jacobians: (T, R, d).
-        places: (T, R) of the pose 0, m.
+        places: (T, R) linearised coordinates at the pose 0, m.
         weights: (T-1, R) r / (q dt).
     """
 
@@ -55,13 +55,13 @@ class RestingTable(NamedTuple):
 
     @classmethod
     def none(cls, times: int, d: int) -> RestingTable:
-        """Nothing rests."""
+        """Return a table without resting points."""
         return cls(np.empty((times, 0, d)), np.empty((times, 0)), np.empty((times - 1, 0)))
 
 
 @dataclass(frozen=True, eq=False)
 class RestingPoints:
-    """Points that may rest, in a frame that stands still.
+    """Points that may rest, in a static frame.
 
     Attributes:
         points: maps poses (N, d) to points (N, P, 3), m.
@@ -73,7 +73,7 @@ class RestingPoints:
 
     @classmethod
     def of_soles(cls, body: Body) -> RestingPoints | None:
-        """Heels and toes of a body; None: it has no feet."""
+        """Return heels and toes of a body, or None if it has no feet."""
         if not len(soles(body)):
             return None
         return cls(
@@ -81,7 +81,7 @@ class RestingPoints:
         )
 
     def along(self, poses: Array, covariances: Array, intervals: Array) -> RestingTable | None:
-        """What rests along a trajectory; None: nothing.
+        """Return the resting points along a trajectory, or None if no point rests.
 
         Args:
             poses: (T, d) at which rest is decided and points are linearised.
@@ -101,10 +101,10 @@ class RestingPoints:
     def held(
         self, prior: TrajectoryPrior, poses: Array, covariances: Array, intervals: Array
     ) -> TrajectoryPrior:
-        """The prior of trajectories near one (T, d) with the points that rest there held.
+        """Add the resting points of a trajectory (T, d) to the prior of trajectories near it.
 
         Args:
-            prior: of the states, whose first d variables are the pose.
+            prior: prior of the states, whose first d variables are the pose.
             poses, covariances, intervals: see `along`.
         """
         found, d = self.along(poses, covariances, intervals), poses.shape[1]
@@ -130,8 +130,8 @@ def rest_probabilities(
     """Probabilities (T-1, P) that a point rests from one pose of a trajectory to the next.
 
     Args:
-        points, jacobians: (T, P, 3), and their derivatives (T, P, 3, d) by the poses.
-        covariances: (T, d, d); only the directions in which points are known least count.
+        points, jacobians: (T, P, 3), and their derivatives (T, P, 3, d) with respect to the poses.
+        covariances: (T, d, d); only the most uncertain direction of each point is used.
         intervals: (T-1,) s.
     """
     spread = product(product(jacobians, covariances[:, None]), jacobians.swapaxes(2, 3))

@@ -1,4 +1,4 @@
-"""Soft prior against parts of the body that run through each other (KJS 2).
+"""Soft prior against intersections of parts of the body (KJS 2).
 
 Two parts overlap by the sum of their radii minus the distance of their axes, taken along the line
 that connects the axes where they are nearest; the overlap is penalised quadratically.
@@ -22,7 +22,7 @@ TOLERANCE = 0.02  # m of overlap without cost: flesh is soft, and ellipsoids fit
 
 
 class _Axes(NamedTuple):
-    """The parts as capsules with elliptic cross-sections, as the compiled code reads them.
+    """The parts as capsules with elliptic cross-sections, for compiled code.
 
     Attributes:
         segments: (B,) that carry them.
@@ -61,13 +61,13 @@ class Overlaps(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SelfIntersection:
-    """The prior against parts of the body that run through each other.
+    """The prior against intersections of parts of the body.
 
-    Its derivatives are those of the distance: that an elliptic cross-section turns is left out.
+    Its derivatives are those of the distance; rotations of elliptic cross-sections are neglected.
 
     Attributes:
         body: whose parts; those that are neighbours along the skeleton are left out.
-        sigma: overlap that costs 1/2, m; inf: none costs anything.
+        sigma: overlap with energy 1/2, m; inf switches the prior off.
     """
 
     body: Body
@@ -81,7 +81,7 @@ class SelfIntersection:
 
 @lru_cache(maxsize=16)
 def overlaps_of(body: Body, sigma: float) -> Overlaps:
-    """The parts of a body as compiled code reads them; sigma: overlap with energy 1/2, m."""
+    """Return the parts of a body for compiled code; sigma: overlap with energy 1/2, m."""
     first, second = _pairs(body)
     skeleton = body.skeleton
     return Overlaps(
@@ -111,7 +111,7 @@ def _axes_of(body: Body) -> _Axes:
 
 @lru_cache(maxsize=16)
 def _pairs(body: Body) -> tuple[Index, Index]:
-    """Pairs of parts that are no neighbours along the skeleton and do not touch at rest."""
+    """Return pairs of parts that are not neighbours in the skeleton and do not touch at rest."""
     parts = body.flesh.parts
     parents = body.skeleton.parents
     fleshy = {p.segment for p in parts}

@@ -2,9 +2,10 @@
 
     theta = (lengths - lengths of the body, growth of each group of parts)
 
-Left and right parts grow alike, so a group is a part or a pair of parts. A point p on a part moves
-with the shape: its segment moves with the lengths above it, and on the part it keeps its place
-u = (p - c) / r, in units of the radii r around the centre c, both of which the shape changes:
+Left and right parts grow equally, so a group is a part or a pair of parts. A point p on a part
+moves with the shape: its segment moves with the lengths above it, and on the part it has the
+constant relative position u = (p - c) / r, for the radii r and the centre c, which depend on the
+shape:
 
     dp / dtheta = d origin / dtheta + R (dc / dtheta + u dr / dtheta)
 
@@ -27,7 +28,7 @@ from hmt_ros.inference.arrays import Array, Mask
 
 # Standard deviations over people and clothes, by kind of growth: logarithms, m.
 GROWTH_SIGMAS = dict(zip(GROWTH, (0.2, 0.2, 0.02, 0.02, 0.02), strict=True))
-# Smallest standard deviation of a length, m: none is known better.
+# Minimum standard deviation of a length, m.
 MIN_LENGTH_SIGMA = 0.008
 
 
@@ -35,7 +36,7 @@ class ShapeSpace:
     """The variables of the shape of a body.
 
     Args:
-        body: at which derivatives are taken; the vector 0 leaves it as it is.
+        body: body at which derivatives are taken; the vector 0 leaves it unchanged.
 
     Attributes:
         body: the same.
@@ -78,7 +79,7 @@ class ShapeSpace:
         return sigmas, covariance
 
     def moved(self, change: Array) -> Body:
-        """The body with a changed shape, (P,): lengths in m, growth as in `GROWTH`."""
+        """Return the body with a changed shape, (P,): lengths in m, growth as in `GROWTH`."""
         names, own = self.body.skeleton.length_names, self.body.skeleton.lengths
         lengths = own + change[: self.lengths]
         grown = change[self.lengths :].reshape(len(self.groups), len(GROWTH))[self._group]
@@ -88,14 +89,14 @@ class ShapeSpace:
     def second_order(
         self, frames: Frames, of_flesh: Array, of_joints: Array
     ) -> tuple[Array, Array, Array]:
-        """Sums over residuals, whose derivatives by shape and pose are r and q, of N poses.
+        """Sum over residuals of N poses with derivatives r by shape and q by pose.
 
         Args:
-            frames: of the poses.
+            frames: frames of the poses.
             of_flesh: (N, 1 + M, 9) residuals of points on the flesh: rows 1 to m of a pose are
                 segment, point and derivative a of the residual by it, camera frame, derivative g
                 and curvature c of the energy by the residual; m is the first number of row 0.
-            of_joints: the same of joints, which take the place of the segments.
+            of_joints: the same for joints, with joints in place of segments.
 
         Returns:
             sum g r (N, P), sum c r r' (N, P, P) and sum c r q' (N, P, d).
@@ -181,7 +182,7 @@ class _ShapeTable(NamedTuple):
     """The shape as compiled code reads it.
 
     Attributes:
-        part_of: (S,) part on each segment; -1: there is none.
+        part_of: (S,) part on each segment; -1 if there is none.
         centres, radii: (B, 3) of the parts.
         by_centre, by_radius: (B, 3, P) their derivatives.
         joint_basis: (J, 3, L) of the skeleton.

@@ -1,7 +1,7 @@
 """The skeleton: a tree of segments, their degrees of freedom, and the lengths that shape them.
 
-Every segment has a frame. Seen from its parent it sits at an offset, moved by its translations,
-with a fixed mount rotation, and is then turned by its rotations, one after the other:
+Every segment has a frame. In its parent's frame it has an offset, moved by its translations, and a
+fixed mount rotation, followed by its own rotations one after the other:
 
     T_segment = T_parent * Trans(offset + t) * mount * Rot(axis_1, q_1) * ... * Rot(axis_n, q_n)
 
@@ -38,8 +38,9 @@ class Skeleton:
             of each degree of freedom, in the order in which they act.
         lower, upper: (d,) hard limits, m or rad.
         joint_names, joint_segments: (J,) name of each joint, and the segment that carries it.
-        joint_basis: (J, 3, L): place of a joint in the frame of its segment = basis @ lengths, m.
-        chains: segments of each limb by its name, from its root outwards.
+        joint_basis: (J, 3, L): position of a joint in the frame of its segment = basis @ lengths,
+            m.
+        chains: segments of each limb by name, from its root outwards.
         length_names, lengths: (L,) m.
     """
 
@@ -140,7 +141,7 @@ class Skeleton:
 
     @cached_property
     def spine(self) -> tuple[int, ...]:
-        """Segments between the pelvis and the neck, from above."""
+        """Segments between the pelvis and the neck, from top to bottom."""
         ends = [s for s, name in zip(self.joint_segments, self.joint_names) if name == 'neck']
         found = [int(s) for s in ends]
         while found and self.parents[found[-1]] > 0:
@@ -217,11 +218,11 @@ class Skeleton:
         return _positions(tuple(names), self.joint_names, 'joint', self.name)
 
     def with_lengths(self, lengths: Mapping[str, float]) -> Skeleton:
-        """The same skeleton with other values (m) of some lengths.
+        """Return the same skeleton with other values (m) of some lengths.
 
         Raises:
             KeyError: a name that the skeleton does not have.
-            ValueError: a length that is not finite.
+            ValueError: a length is not finite.
         """
         new = self.lengths.copy()
         where = _positions(tuple(lengths), self.length_names, 'length', self.name)
@@ -236,7 +237,7 @@ class Skeleton:
         return result
 
 
-# What follows from the lengths of a skeleton; all else stays when they change.
+# Cached properties that depend on the lengths of a skeleton.
 _BY_LENGTHS = ('offsets', 'joint_offsets', 'trunk_joints', 'bones')
 
 
@@ -249,7 +250,7 @@ def sided_pairs(names: Iterable[str]) -> tuple[tuple[str, str], ...]:
 
 @lru_cache(maxsize=256)
 def other_side(name: str) -> str:
-    """The name with left for right and right for left."""
+    """Return the name with left and right exchanged."""
     for side, other in (('left_', 'right_'), ('right_', 'left_')):
         if name.startswith(side):
             return other + name.removeprefix(side)
@@ -258,7 +259,7 @@ def other_side(name: str) -> str:
 
 @lru_cache(maxsize=256)
 def _positions(names: tuple[str, ...], known: tuple[str, ...], kind: str, owner: str) -> Index:
-    """Positions of names among those that are known; not to be written to."""
+    """Return a read-only array of positions of names in the known names."""
     place = {name: i for i, name in enumerate(known)}
     missing = [name for name in names if name not in place]
     if missing:

@@ -120,7 +120,7 @@ class PoseEnergy {
     return total;
   }
 
-  // Takes the sums over the segments to the derivatives of a cue; they begin anew.
+  // Takes the sums over the segments to the derivatives of a cue, and reset them.
   void assemble(Index cue) {
     assemble_pose(terms_.model.tree, axes_, dof_origins_, segments_, gradients_[cue],
                   hessians_[cue]);

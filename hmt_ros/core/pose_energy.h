@@ -32,7 +32,7 @@ struct Terms {
   Overlaps overlaps;
   GroundConstants ground;
   FlowTerm flow;
-  Table centres;      // (R, f) of the motion; no rows: there is none
+  Table centres;      // (R, f) of the motion prior; no rows: none
   Tables precisions;  // (R, f, f)
   double tails;       // degrees of freedom of the motion; 0: it is Gaussian
 

@@ -13,7 +13,7 @@ namespace hmt {
 
 // The shape: S segments, B parts, J joints, P variables, of which L lengths come first.
 struct ShapeTable {
-  Places part_of;                   // (S,) part on each segment; -1: there is none
+  Places part_of;                   // (S,) part on each segment; -1: none
   Table centres, radii;             // (B, 3)
   Tables by_centre, by_radius;      // (B, 3, P) their derivatives
   Tables joint_basis;               // (J, 3, L)

@@ -42,7 +42,7 @@ struct Vertices {
 struct Scene {
   Lens lens;
   std::array<double, 2> size;
-  Array<const bool, 2> others;  // empty: there are none
+  Array<const bool, 2> others;  // empty: none
 
   bool shows(const double* pixel) const {
     const double u = pixel[0], v = pixel[1];

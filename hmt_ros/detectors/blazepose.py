@@ -1,9 +1,10 @@
 """BlazePose, the detector of MediaPipe Pose: 33 landmarks of one person, in pixels and in metres.
 
-Two networks find them. One looks for a person in the whole image, and tells the middle of the hips
-and a point of a circle about the body. The other sees the square about that circle, turned upright,
-and tells landmarks, positions and a mask. Two of its landmarks are the circle again, so that the
-next image needs the second network alone. One-euro filters smooth landmarks and circle:
+Two networks find them. The first searches the whole image for a person, and outputs the middle of
+the hips and a point of a circle around the body. The second sees the square around that circle,
+turned upright, and outputs landmarks, positions and a mask. Two of its landmarks define the circle
+again, so that the next image needs the second network alone. One-euro filters smooth landmarks and
+circle:
 
     y_t = y_(t-1) + a(f) (x_t - y_(t-1)),    f = f_0 + b |v_t|,    a(f) = 1 / (1 + 1 / (2 pi f dt))
 
@@ -40,18 +41,18 @@ LANDMARKS = 33
 _LONGEST_INTERVAL = 1_000_000_000
 # Sides of the inputs of the networks, px, and of the heat maps of landmarks.
 _PERSON_SIZE, _LANDMARK_SIZE, _HEAT_SIZE = 224, 256, 64
-# Cells of the first network, px, and predictions of each; the overlap from which two are one.
+# Cell sizes of the first network, px, and predictions per cell; overlap above which two are one.
 _STRIDES, _PREDICTIONS, _SAME = (8, 16, 32), (2, 2, 6), 0.3
-# Probability from which somebody is there, and from which a pixel belongs to them.
+# Minimum probability that somebody is there, and that a pixel belongs to the person.
 _SEEN = 0.5
-# Quality of somebody who lies or hangs against that of somebody upright.
+# Quality of a person who lies or is upside down, relative to an upright person.
 _LYING = 0.6
-# Half the side of the window of a heat map about its landmark; its least peak.
+# Half side of the window of a heat map around its landmark, cells; its minimum peak.
 _HEAT_REACH, _HEAT_PEAK = 4, 0.5
 # Cutoffs f_0 of the one-euro filters, Hz, and factors b on velocities, which raise them.
 _VELOCITY_CUTOFF = 1.0
 _LANDMARK_CUTOFF, _CIRCLE_CUTOFF, _POSITION_CUTOFF = (0.05, 80.0), (0.01, 10.0), (0.1, 40.0)
-# The share of an image in the smoothed visibility.
+# Weight of a new image in the smoothed visibility.
 _NEW_VISIBILITY = 0.1
 
 _Tensor = NDArray[np.float32]
@@ -64,7 +65,7 @@ class BlazePose:
         with_mask: whether `mask` is wanted as well.
 
     Attributes:
-        mask: (H, W) where the person was seen in the last image; None without `with_mask`.
+        mask: (H, W) pixels of the person in the last image; None without `with_mask`.
 
     Raises:
         DetectorError: the detector is not installed.
@@ -81,8 +82,8 @@ class BlazePose:
     def detect(self, image: Image, stamp_ns: int) -> Keypoints | None:
         """The landmarks of the person in an image, named as in the scheme 'mediapipe33'.
 
-        An image begins a new sequence if it is not younger than the one before, is younger by more
-        than 1 s, or has another size.
+        An image begins a new sequence if it is not newer than the one before, is newer by more than
+        1 s, or has another size.
 
         Args:
             image: (H, W, 3) BGR.
@@ -90,7 +91,7 @@ class BlazePose:
 
         Returns:
             The keypoints, with unknown covariances, the visibilities as confidences, and positions
-            in m from the middle of the hips along the axes of the camera. None: nobody was seen.
+            in m from the middle of the hips along the axes of the camera. None if nobody was seen.
         """
         interval = stamp_ns - self._newest
         if not 0 < interval <= _LONGEST_INTERVAL or image.shape[:2] != self._size:
@@ -110,7 +111,7 @@ class BlazePose:
         return self._followed.smooth(found, interval * 1e-9)
 
     def _circle(self, image: Image) -> Array | None:
-        """Centre and a point (2, 2) of the circle about the most certain person."""
+        """Centre and a point (2, 2) of the circle around the surest person; None if unseen."""
         height, width = image.shape[:2]
         whole = Square((width / 2, height / 2), max(height, width), 0.0)
         return next((circle for _, circle in self._networks.circles(image, whole)), None)
@@ -129,16 +130,16 @@ class Networks:
         self._anchors = _anchors()
 
     def circles(self, image: Image, square: Square) -> Iterator[tuple[float, Array]]:
-        """Scores and circles, centre and a point (2, 2), px, about people, the surest first.
+        """Scores of people and circles around them (centre and a point, (2, 2), px), surest first.
 
-        Predictions that overlap with the surest one left are averaged with it.
+        Predictions that overlap with the surest remaining one are averaged with it.
         """
         seen = square.seen(image, _PERSON_SIZE, cv2.BORDER_CONSTANT)
         boxes, logits = self._person(seen * np.float32(2 / 255) - np.float32(1))
         scores = sigmoid(logits[:, 0].astype(np.float64))
         chosen = np.flatnonzero(scores >= _SEEN)
         scores = scores[chosen]
-        # Middle and size of the face, then points of the body, in parts of the square.
+        # Middle and size of the face, then points of the body, as fractions of the square.
         points = boxes[chosen].astype(np.float64).reshape(-1, 6, 2) / _PERSON_SIZE
         points[:, [0, 2, 3]] += self._anchors[chosen, None]
         while len(scores):
@@ -154,7 +155,7 @@ class Networks:
             points, scores = points[~same], scores[~same]
 
     def landmarks(self, image: Image, square: Square) -> Found | None:
-        """The landmarks of the person in a square; None: nobody is there."""
+        """The landmarks of the person in a square; None if nobody is there."""
         if square.side < 1.0:
             return None
         seen = square.seen(image, _LANDMARK_SIZE, cv2.BORDER_REPLICATE)
@@ -223,7 +224,7 @@ class Followed:
         self._of_positions = _OneEuroFilter(*_POSITION_CUTOFF)
 
     def smooth(self, found: Found, interval: float) -> Keypoints:
-        """The keypoints that are found, smoothed, `interval` s after the image before."""
+        """The keypoints that were found, smoothed, `interval` s after the image before."""
         landmarks, circle = found.points[:LANDMARKS], found.points[LANDMARKS:]
         diameter = max(2 * math.hypot(*(circle[1] - circle[0])), 1.0)
         self.circle = self._of_circle(circle, interval, diameter)
@@ -241,14 +242,14 @@ class Followed:
 
 
 class _OneEuroFilter:
-    """Smooths an array, the less the faster it changes; see the head of the module."""
+    """Smooths an array, less where it changes faster; see the head of the module."""
 
     def __init__(self, cutoff: float, gain: float) -> None:
         self._cutoff, self._gain = cutoff, gain
         self._last: Array | None = None
 
     def __call__(self, values: Array, interval: float, scale: float) -> Array:
-        """The smoothed values; `scale` is the length that velocities are measured in."""
+        """The smoothed values; `scale` is the unit of length of velocities."""
         if self._last is None:
             self._smoothed, self._velocity = values, np.zeros_like(values)
         else:
@@ -280,7 +281,7 @@ class _Network:
 
 
 def _anchors() -> Array:
-    """(2254, 2) middles of the cells of the first network's predictions, in parts of its image."""
+    """Cell centres (2254, 2) of the first network's predictions, as fractions of its image."""
     result = []
     for stride, predictions in zip(_STRIDES, _PREDICTIONS):
         middles = (np.arange(_PERSON_SIZE // stride) + 0.5) * stride / _PERSON_SIZE
@@ -290,7 +291,7 @@ def _anchors() -> Array:
 
 
 def _refined(points: Array, heat: _Tensor) -> Array:
-    """Points (n, 2) in parts of the image, moved to the mean of the heat about each.
+    """Points (n, 2), fractions of the image, moved to the mean of the heat around each.
 
     Args:
         heat: (64, 64, n) logits of heat maps.

@@ -14,11 +14,11 @@ from pathlib import Path
 from hmt_ros.detectors.detector import DetectorError
 from hmt_ros.detectors.network_files import NetworkFiles, run_installer
 
-# Package that runs the networks, and the module that it brings.
+# Package that runs the networks, and its module.
 RUNTIME, RUNTIME_MODULE = 'ai-edge-litert', 'ai_edge_litert'
 PERSON = 'pose_detection.tflite'
 LANDMARKS = 'pose_landmark_full.tflite'
-# In the wheel of a release of MediaPipe.
+# The files in the wheel of a release of MediaPipe.
 FILES = NetworkFiles(
     'blazepose',
     'mediapipe==0.10.21',
@@ -28,7 +28,7 @@ FILES = NetworkFiles(
     },
 )
 
-# The networks are the same in the wheels of all platforms: one that every release of pip accepts.
+# pip's options for a wheel that every release of it accepts; all wheels have the same networks.
 _ANY_WHEEL = (
     *('--no-deps', '--only-binary=:all:', '--platform=manylinux_2_28_x86_64'),
     *('--python-version=3.12', '--implementation=cp', '--abi=cp312'),
@@ -41,7 +41,7 @@ def has_networks() -> bool:
 
 
 def has_runtime() -> bool:
-    """Whether this Python has the package that runs them."""
+    """Whether this Python has the package that runs the networks."""
     return importlib.util.find_spec(RUNTIME_MODULE) is not None
 
 
@@ -70,7 +70,7 @@ def install() -> None:
     """Installs LiteRT with pip, and takes the networks out of the wheel of MediaPipe.
 
     Raises:
-        ValueError: pip fails, or the wheel has other networks; one line.
+        ValueError: pip fails, or the wheel has other networks; the message is one line.
     """
     if not has_runtime():
         _pip('install', RUNTIME)

@@ -1,8 +1,8 @@
-"""The colours of a person's clothes, torso and legs apart, which tell people apart.
+"""The colours of a person's clothes, on torso and legs, which distinguish people.
 
-A part is the area between its landmarks: the quadrangle of shoulders and hips, and limbs as wide as
-a share of the trunk is long. Its colours are a histogram; two parts differ by Hellinger's distance
-squared, 1 - sum sqrt(p q), from 0 to 1.
+A part is the area between its landmarks: the quadrangle of shoulders and hips, or legs whose width
+is a fraction of the length of the trunk. Its colours are a histogram; the distance of two parts is
+the square of Hellinger's, 1 - sum sqrt(p q), from 0 to 1.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from hmt_ros.inference.arrays import Array, Image
 
 TORSO = ('left_shoulder', 'right_shoulder', 'right_hip', 'left_hip')
 LEGS = (('left_hip', 'left_knee', 'left_ankle'), ('right_hip', 'right_knee', 'right_ankle'))
-# The fewest pixels of a part; the width of a leg over the length of the trunk.
+# Minimum number of pixels of a part; ratio of the width of a leg to the length of the trunk.
 FEWEST, WIDTH = 40, 0.22
-# Visibility from which a landmark counts; side to which a person is reduced, px.
+# Minimum visibility of a landmark that counts; maximum side of the image of a person, px.
 VISIBLE, SIDE = 0.5, 96
 
 
 @dataclass(frozen=True, eq=False)
 class Clothes:
-    """Shares (2, BINS^3) of colours on torso and legs; NaN: the part is not seen."""
+    """Shares (2, BINS^3) of colours on torso and legs; NaN if the part is not seen."""
 
     shares: Array
 
@@ -71,7 +71,7 @@ class Clothes:
         return float(np.nanmean(each)) if np.isfinite(each).any() else np.nan
 
     def mixed(self, other: Clothes, share: float) -> Clothes:
-        """These colours with a share of others; a part that one lacks is that of the other."""
+        """These colours mixed with a share of others; a part that one lacks is the other's."""
         mixed = self.shares + share * (other.shares - self.shares)
         known = np.where(np.isnan(self.shares), other.shares, self.shares)
         return Clothes(np.where(np.isnan(mixed), known, mixed))

@@ -1,4 +1,4 @@
-"""What a detector of keypoints is, and how one is made and installed.
+"""The interface of detectors of keypoints, and of their construction and installation.
 
 A new detector is a file beside this one with a `DetectorKind`, and a line in `registry.DETECTORS`.
 """
@@ -14,7 +14,7 @@ from hmt_ros.inference.arrays import Image, Mask
 
 
 class DetectorError(ValueError):
-    """The detector is not installed; one line says what to run."""
+    """The detector is not installed; the message, one line, says what to run."""
 
 
 class Detector(Protocol):
@@ -25,8 +25,8 @@ class Detector(Protocol):
     numbers and reads no clock.
 
     Attributes:
-        mask: (H, W) where the person was seen in the last image; None: no mask was asked for, or
-            the detector finds none.
+        mask: (H, W) pixels of the person in the last image; None if no mask was requested, or the
+            detector has none.
     """
 
     mask: Mask | None
@@ -34,18 +34,18 @@ class Detector(Protocol):
     def detect(self, image: Image, stamp_ns: int) -> Keypoints | None:
         """The keypoints of the person in an image.
 
-        An image that is not younger than the one before, or that has another size, begins a new
+        An image that is not newer than the one before, or that has another size, begins a new
         sequence.
 
         Args:
             image: (H, W, 3) BGR, with square pixels.
-            stamp_ns: of the image.
+            stamp_ns: stamp of the image.
 
         Returns:
             Landmarks under the names of a scheme of `keypoint_schemes.yaml`, pixels with (0, 0) at
             the centre of the first pixel, covariances, px^2, or NaN where unknown, and confidences
-            from 0 to 1; `positions`, m, along the axes of the camera, of a detector that lifts.
-            None: nobody was seen.
+            from 0 to 1; `positions`, m, along the axes of the camera, if the detector
+            lifts. None if nobody was seen.
         """
         ...
 
@@ -56,10 +56,10 @@ class DetectorKind:
 
     Attributes:
         title: name of the detector, for users.
-        make: makes a detector that has seen no image, `make(with_mask=...)`: whether `mask` is
-            wanted as well. Raises DetectorError where the detector is not installed.
+        make: `make(with_mask=...)` makes a detector that has seen no image; `with_mask` is whether
+            `mask` is wanted as well. Raises DetectorError if the detector is not installed.
         is_installed: whether the detector can run here.
-        install: installs what is missing; raises ValueError, in one line, where that fails.
+        install: installs what is missing; raises ValueError, in one line, if that fails.
     """
 
     title: str

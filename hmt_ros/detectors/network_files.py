@@ -1,7 +1,7 @@
-"""Files of networks, which packages of others carry: taken out of their archives, by their SHA-256.
+"""Files of networks from packages of others: extracted from archives, and checked by SHA-256.
 
-They lie in a folder of share/hmt_ros of the Python environment or, where that can not be written,
-of the user.
+They lie in a folder of share/hmt_ros of the Python environment or, if that cannot be written, of
+the user.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class NetworkFiles:
 
     Attributes:
         folder: name of the folder that they lie in.
-        source: package that carries them, with its release.
+        source: package that contains them, with its release.
         checksums: SHA-256 by name.
     """
 
@@ -32,7 +32,7 @@ class NetworkFiles:
     checksums: Mapping[str, str]
 
     def folders(self) -> tuple[Path, Path]:
-        """Where the files are sought: in the folder of the environment, then in the user's."""
+        """Folders that are searched for the files: that of the environment, then the user's."""
         user = sysconfig.get_path('data', sysconfig.get_preferred_scheme('user'))
         environment, own = (
             Path(data, 'share', 'hmt_ros', self.folder)
@@ -55,18 +55,18 @@ class NetworkFiles:
         return all(self.content(name) is not None for name in self.checksums)
 
     def absence(self, name: str) -> str:
-        """What is said of a file that is not there."""
+        """The message about a file that is not there."""
         return f'no {name} as of {self.source} in {" or ".join(map(str, self.folders()))}'
 
     def taken_from(self, archive: Path, read: Callable[[str], bytes | None]) -> dict[str, bytes]:
         """The files of an archive, by name.
 
         Args:
-            archive: that they are read from.
-            read: content of the file of a name; None: the archive has none.
+            archive: archive that they are read from.
+            read: returns the content of a file by name; None if the archive lacks it.
 
         Raises:
-            ValueError: the archive lacks one, or has another.
+            ValueError: the archive lacks a file, or a file has another checksum.
         """
         found = {}
         for name, checksum in self.checksums.items():
@@ -81,7 +81,7 @@ class NetworkFiles:
         return found
 
     def write(self, content: Mapping[str, bytes]) -> None:
-        """Writes files for all users of this Python or, where that is not allowed, for this one."""
+        """Writes files for all users of this Python or, if that is not allowed, for this one."""
         everybody, own = self.folders()
         try:
             everybody.mkdir(parents=True, exist_ok=True)
@@ -98,7 +98,7 @@ def run_installer(command: list[str]) -> None:
     """Runs a command that installs or downloads.
 
     Raises:
-        ValueError: it fails; one line.
+        ValueError: the command fails; the message is one line.
     """
     done = subprocess.run(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False

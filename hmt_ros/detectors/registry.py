@@ -13,7 +13,7 @@ DETECTORS: dict[str, DetectorKind] = {
 }
 # The detector that is used unless another is named.
 USUAL_DETECTOR = 'mediapipe'
-# Detectors for those who can wait, the surest first.
+# Detectors for uses without a time limit, the surest first.
 _SUREST = ('mediapipe+movenet', USUAL_DETECTOR)
 
 

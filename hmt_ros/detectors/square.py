@@ -1,4 +1,4 @@
-"""The square of an image that a network sees, and what it says of it."""
+"""The square of an image that a network sees, and its output in that square."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.inference.linear_algebra import product
 
-# The square's side over the diameter of what it is about.
+# Ratio of the square's side to the diameter of its content.
 _MARGIN = 1.25
 
 Float = TypeVar('Float', np.float32, np.float64)
@@ -23,7 +23,7 @@ Values = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Square:
-    """A square of the image: its centre, px, side, px, and the angle of its turn, radians."""
+    """A square of the image: its centre, px, side, px, and rotation, rad."""
 
     centre: tuple[float, float]
     side: float
@@ -31,27 +31,27 @@ class Square:
 
     @classmethod
     def about(cls, circle: Array) -> Square:
-        """The square about a circle, with the circle's point above the centre."""
+        """The square around a circle, with the circle's point above the centre."""
         centre, (along, down) = circle[0], circle[1] - circle[0]
         side = 2 * _MARGIN * math.hypot(along, down)
         return cls((centre[0], centre[1]), side, float(elementary.arctan2(along, -down)))
 
     @classmethod
     def around(cls, points: Array) -> Square:
-        """The upright square about points (n, 2)."""
+        """The upright square around points (n, 2)."""
         low, high = points.min(axis=0), points.max(axis=0)
         middle = (low + high) / 2
         return cls((middle[0], middle[1]), _MARGIN * float((high - low).max()), 0.0)
 
     @property
     def axes(self) -> Array:
-        """(2, 2) directions to the right and down in the square."""
+        """Unit vectors (2, 2) to the right and down in the square, in rows."""
         c, s = float(elementary.cos(self.angle)), float(elementary.sin(self.angle))
         return np.array([[c, s], [-s, c]])
 
     @property
     def corner(self) -> Array:
-        """(2,) of the upper left, px."""
+        """Upper left corner (2,), px."""
         result: Array = self.centre - self.axes.sum(axis=0) * (self.side / 2)
         return result
 
@@ -63,7 +63,7 @@ class Square:
         return np.asarray(result[..., ::-1], np.uint8)
 
     def spread(self, values: Values, size: tuple[int, int]) -> Values:
-        """An image of `size`, (H, W), with the values (n, n) of the square in its place."""
+        """The values (n, n) of the square, placed in an image of `size` (H, W)."""
         to_square = self.axes * (len(values) / self.side)
         matrix = np.column_stack([to_square, product(-to_square, self.corner)])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

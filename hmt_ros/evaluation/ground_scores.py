@@ -1,8 +1,8 @@
-"""Feet against the true floor: whether those that stand slide, and whether they sink in.
+"""Scores of feet against the true floor (sliding and depth below it), and of the vertical.
 
 The sliding of a foot is the speed of its ankle in the world between two frames in which the foot
 truly stands. Depths are those of ankles and toes below the true plane of the floor; the sole lies
-some centimetres below the ankle, so a pose that does not sink in has a depth of 0.
+some centimetres below the ankle, so that a pose that does not sink in has a depth of 0.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from hmt_ros.inference.arrays import Array
 
 ANKLES = ('left_ankle', 'right_ankle')
 FEET = (*ANKLES, 'left_toe', 'right_toe')
-# A joint that is deeper counts as sunk in, m.
+# Maximum depth below the floor of a joint that has not sunk in, m.
 SUNK = 0.02
-# Frames further apart than this many times the usual interval are no neighbours.
+# Maximum interval between neighbouring frames, relative to the median interval.
 _GAP = 1.5
 
 
@@ -29,10 +29,10 @@ class TrueGround:
 
     Attributes:
         up: (3,) unit vector against gravity, camera frame.
-        height: of the camera above the floor, m.
+        height: height of the camera above the floor, m.
         standing: (2,) whether the left and the right foot stand; None: unknown.
-        camera_rotation: (3, 3) from the camera to a world that rests, and
-        camera_position: (3,) in it, m.
+        camera_rotation: (3, 3) rotation from the camera to a stationary world frame.
+        camera_position: (3,) position of the camera in the world frame, m.
     """
 
     up: Array
@@ -44,12 +44,12 @@ class TrueGround:
 
 @dataclass(frozen=True)
 class GroundScores:
-    """Feet of the heaviest mode.
+    """Scores of the feet of one pose per frame, such as the heaviest mode.
 
     Attributes:
-        sliding: mean speed of standing ankles, m/s; None: no foot is known to stand.
-        depth: mean depth of ankles and toes below the floor, m; 0 for those above.
-        sunk: fraction of the frames in which one is deeper than `SUNK`.
+        sliding: mean speed of standing ankles, m/s; None if no foot is known to stand.
+        depth: mean depth of ankles and toes below the floor, m; joints above count as 0.
+        sunk: fraction of the frames in which an ankle or a toe is deeper than `SUNK`.
         frames: number of frames.
     """
 
@@ -59,7 +59,7 @@ class GroundScores:
     frames: int
 
     def summary(self) -> dict[str, float | int | None]:
-        """The numbers by name, lengths in mm."""
+        """Return the scores by name, lengths in mm."""
         return {
             'sliding_m_per_s': self.sliding,
             'below_floor_mm': 1e3 * self.depth,
@@ -77,12 +77,12 @@ class GroundScores:
 
 @dataclass(frozen=True)
 class GravityScores:
-    """How well the vertical of a track is known.
+    """Scores of the vertical of a track.
 
     Attributes:
-        error: median angle to the true one, rad.
-        said: median deviation of that angle about each horizontal axis, as the track says, rad;
-            NaN: it does not say.
+        error: median angle to the true vertical, rad.
+        said: median of the standard deviation about each horizontal axis that the track reports,
+            rad; NaN: not reported.
         frames: number of frames.
     """
 
@@ -91,7 +91,7 @@ class GravityScores:
     frames: int
 
     def summary(self) -> dict[str, float | int | None]:
-        """The numbers by name, angles in degrees."""
+        """Return the scores by name, angles in degrees."""
         return {
             'error_degrees': float(np.degrees(self.error)),
             'said_degrees': None if np.isnan(self.said) else float(np.degrees(self.said)),
@@ -109,11 +109,12 @@ class GravityScores:
 def gravity_scores(
     ups: Mapping[int, tuple[Array, float]], truth: Mapping[int, TrueGround]
 ) -> GravityScores | None:
-    """Scores of a vertical; None: no frame has a truth.
+    """Score a vertical; return None if no frame has a truth.
 
     Args:
-        ups: stamp in ns -> unit vector (3,) against gravity, camera frame, and its deviation, rad.
-        truth: by stamp in ns.
+        ups: stamp in ns -> unit vector (3,) against gravity, camera frame, and its standard
+            deviation, rad.
+        truth: true ground by stamp in ns.
     """
     stamps = sorted(ups.keys() & truth.keys())
     if not stamps:
@@ -126,12 +127,12 @@ def gravity_scores(
 def ground_scores(
     joints: Mapping[int, Array], names: Sequence[str], truth: Mapping[int, TrueGround]
 ) -> GroundScores | None:
-    """Scores of feet; None: no frame has a truth, or there are no joints of feet.
+    """Score feet; return None if no frame has a truth, or there are no joints of feet.
 
     Args:
-        joints: stamp in ns -> (J, 3) of one pose, m, camera frame.
-        names: (J,) of the joints.
-        truth: by stamp in ns.
+        joints: stamp in ns -> (J, 3) joint positions of one pose, m, camera frame.
+        names: (J,) names of the joints.
+        truth: true ground by stamp in ns.
     """
     stamps = sorted(joints.keys() & truth.keys())
     feet = [names.index(name) for name in FEET if name in names]
@@ -154,7 +155,7 @@ def _sliding(
     names: Sequence[str],
     truth: Mapping[int, TrueGround],
 ) -> float | None:
-    """Mean speed of the standing ankles, m/s; None: there are none."""
+    """Return the mean speed of standing ankles, m/s; None if there are none."""
     if len(stamps) < 2:
         return None
     usual = _GAP * float(np.median(np.diff(stamps)))
@@ -174,5 +175,5 @@ def _sliding(
 
 
 def _placed(point: Array, truth: TrueGround) -> Array:
-    """A point (3,) of the camera frame in the world."""
+    """Transform a point (3,) from the camera frame to the world frame."""
     return truth.camera_rotation @ point + truth.camera_position

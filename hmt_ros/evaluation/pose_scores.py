@@ -1,15 +1,15 @@
 """Errors and calibration of mixtures over poses, against the true joint positions.
 
 Joint positions relative to an origin are compared, so that bodies with different degrees of freedom
-have comparable scores. The origin is the pelvis, or the middle of the hips where the truth has no
+have comparable scores. The origin is the pelvis, or the centre of the hips if the truth has no
 pelvis. A component N(m, S) over poses becomes one over joint positions by linearisation,
 
     N(f(m), J S J^T + D + s^2 I),   f: joints minus origin,   J = df/dx at m.
 
-The diagonal D holds the errors that every pose of the body has, because its joints are not exactly
-those of the person (`Body.joint_errors`), as published covariances of joints do. Without it the
-density would be confined to a surface: 13 joints have 39 coordinates, and fewer degrees of freedom
-move them. s is added by an evaluator, usually 0.
+The diagonal D has the variances of the errors that every pose of the body has, because its joints
+are not exactly those of the person (`Body.joint_errors`); published covariances of joints include
+it, too. Without D the density would be confined to a surface: 13 joints have 39 coordinates, which
+fewer degrees of freedom move. s is an additional standard deviation for evaluation, usually 0.
 """
 
 from __future__ import annotations
@@ -47,23 +47,24 @@ EVALUATED_JOINTS = (
     'right_ankle',
 )
 ORIGIN = 'pelvis'
-# Their middle is the origin where the truth has no pelvis.
+# Joints whose centre is the origin if the truth has no pelvis.
 HIPS = ('left_hip', 'right_hip')
-# Standard deviation of a coordinate that is added to those that are published, m.
+# Additional standard deviation of a coordinate (s above), m.
 MODEL_SIGMA = 0.0
-# A frame is lost when the mean joint error of its best hypothesis reaches this, m.
+# Minimum of the mean joint error of the best component at which a frame counts as lost, m.
 LOST = 0.15
-# Number of samples of a density from which a level is estimated.
+# Number of samples of a density for the estimate of a level.
 SAMPLES = 500
-# Number of mixtures whose kinematics is computed together.
+# Number of mixtures whose kinematics are computed together.
 BATCH = 32
 
 
 def origin_joints(names: Sequence[str], source: str = 'truth') -> tuple[str, ...]:
-    """Joints whose mean position is the origin: the pelvis or, without one, both hips.
+    """Return the joints whose mean position is the origin: the pelvis, or else both hips.
 
     Args:
-        names: of the joints whose true positions are known.
+        names: names of the joints whose true positions are known.
+        source: source of the positions, for the error.
 
     Raises:
         ValueError: neither is known.
@@ -79,15 +80,16 @@ def origin_joints(names: Sequence[str], source: str = 'truth') -> tuple[str, ...
 def relative_positions(
     positions: Array, names: Sequence[str], joints: Sequence[str], origin: Sequence[str] = (ORIGIN,)
 ) -> Array:
-    """Positions (..., J, 3) of some joints relative to the origin.
+    """Return the positions (..., J, 3) of some joints relative to the origin.
 
     Args:
-        positions: (..., J', 3) of all joints.
-        names: (J',) of all joints.
+        positions: (..., J', 3) positions of all joints.
+        names: (J',) names of all joints.
+        joints: (J,) names of the joints to return.
         origin: joints whose mean position is the origin.
 
     Raises:
-        ValueError: joints that are not among the names.
+        ValueError: a joint is not among the names.
     """
     missing = [name for name in (*origin, *joints) if name not in names]
     if missing:
@@ -98,15 +100,15 @@ def relative_positions(
 
 @dataclass(frozen=True, eq=False)
 class JointMixture:
-    """Hypotheses about joint positions at one time, relative to the origin.
+    """A mixture over joint positions at one time, relative to the origin.
 
     Attributes:
-        weights: (K,) sum to 1.
-        joints: (K, J, 3) m.
+        weights: (K,) weights; they sum to 1.
+        joints: (K, J, 3) joint positions, m.
         covariances: (K, 3J, 3J) m^2; None if unknown.
 
     Raises:
-        ValueError: shapes that do not fit, or values that are not finite.
+        ValueError: shapes do not match, or values are not finite.
     """
 
     weights: Array
@@ -124,7 +126,7 @@ class JointMixture:
                 raise ValueError(f'{name} must be finite and have shape {shape}, saw {value.shape}')
 
     def density(self) -> GaussianMixture:
-        """The mixture over 3J coordinates.
+        """Return the mixture over 3J coordinates.
 
         Raises:
             ValueError: the covariances are unknown.
@@ -144,19 +146,19 @@ def joint_mixtures(
     positions: Sequence[Array] | None = None,
     origin: Sequence[str] = (ORIGIN,),
 ) -> list[JointMixture]:
-    """Mixtures over joint positions relative to the origin, by linearisation.
+    """Compute mixtures over joint positions relative to the origin, by linearisation.
 
     Args:
-        mixtures: (T,) over poses (d,).
-        names: (J,) of the joints.
-        model_sigma: standard deviation of a coordinate that is added, m.
-        positions: for each mixture (K, J', 3) of all joints of the body at the means, m; None:
-            computed from the means.
-        origin: joints whose mean position is the origin; empty: that of the camera.
+        mixtures: (T,) mixtures over poses (d,).
+        names: (J,) names of the joints.
+        model_sigma: additional standard deviation of a coordinate, m.
+        positions: for each mixture positions (K, J', 3) of all joints of the body at the means, m;
+            None: computed from the means.
+        origin: joints whose mean position is the origin; empty: origin of the camera frame.
 
     Raises:
-        KeyError: a joint that the body does not have.
-        ValueError: a mixture over poses of another body.
+        KeyError: the body does not have a joint.
+        ValueError: a mixture is over poses of another body.
     """
     which = body.skeleton.joint_index([*names])
 
@@ -169,7 +171,7 @@ def joint_mixtures(
 
     own = np.diag(np.repeat(np.square(body.joint_errors[which]) + model_sigma**2, 3))
     result = []
-    # Kinematics in batches: one frame alone would cost ten times as much a pose.
+    # Kinematics in batches: frame by frame a pose would take ten times as long.
     for first in range(0, len(mixtures), BATCH):
         batch = mixtures[first : first + BATCH]
         means = np.concatenate([mixture.means for mixture in batch])
@@ -190,18 +192,19 @@ def joint_mixtures(
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Distances of mixtures from the truth, frame by frame: T frames, J joints.
+    """Errors of mixtures against the truth, frame by frame: T frames, J joints.
 
     Attributes:
-        names: (J,) of the joints.
-        heaviest: (T, J) errors of the joints of the heaviest component, m.
-        best: (T, J) errors of the component whose mean joint error is least, m.
+        names: (J,) names of the joints.
+        heaviest: (T, J) joint errors of the heaviest component, m.
+        best: (T, J) joint errors of the component with the smallest mean joint error, m.
         expected: (T, J) weighted mean of the errors of all components, m.
         modes: (T,) number of components.
         perplexity: (T,) exp of the entropy of the weights: the effective number of components.
         log_densities: (T,) log p(true joint positions), positions in m; None without covariances.
-        levels: (T,) of the true positions of all joints together, see `inference.calibration`.
-        joint_levels: (T, J) of the true position of each joint alone.
+        levels: (T,) levels of the true positions of all joints together, see
+            `inference.calibration`; None without covariances.
+        joint_levels: (T, J) levels of the true position of each joint alone; None likewise.
         absolute_levels: (T, J) the same in the frame of the camera; None: unknown.
     """
 
@@ -221,7 +224,7 @@ class Scores:
 
     @staticmethod
     def concatenate(parts: Sequence[Scores]) -> Scores:
-        """Scores of consecutive parts; densities are known if those of all parts are."""
+        """Concatenate scores of consecutive parts; a field is None if it is None in any part."""
 
         def joined(name: str) -> Any:
             values = [getattr(part, name) for part in parts]
@@ -231,14 +234,14 @@ class Scores:
 
     @staticmethod
     def of_nobody(names: Sequence[str], frames: int = 0) -> Scores:
-        """Scores of frames without an estimate: NaN."""
+        """Return scores of frames without an estimate: NaN."""
         errors, each = np.full((frames, len(names)), np.nan), np.full(frames, np.nan)
         return Scores(tuple(names), errors, errors, errors, each, each, None, None, None)
 
     def summary(self) -> dict[str, Any]:
-        """Means over the frames, errors in mm; None for scores that need unknown covariances.
+        """Return means over the frames, errors in mm; None if the covariances are unknown.
 
-        They are NaN where there are no frames.
+        Without frames the means are NaN.
         """
         if not len(self):
             return self.of_nobody(self.names, 1).summary() | {'frames': 0}
@@ -299,18 +302,18 @@ def marginal_regions(
     seed: int | np.random.Generator = 0,
     samples: int = SAMPLES,
 ) -> tuple[Array, Array]:
-    """Regions of each joint alone: levels of the truth, and volumes.
+    """Compute levels of the truth and volumes of the credible regions of each joint alone.
 
     Args:
-        mixtures: (T,) of the same joints.
-        truth: (T, J, 3) true positions from the same origin, m.
+        mixtures: (T,) mixtures over positions of the same joints.
+        truth: (T, J, 3) true positions relative to the same origin, m.
 
     Returns:
-        Levels (T, J) of the true positions, see `score`; volumes (T, J) of the regions of 90 %,
-        m^3: the mean of 1 / p over samples of p, those outside the region counted as 0.
+        Levels (T, J) of the true positions, see `Scores`; volumes (T, J) of the 90 % regions, m^3:
+        the mean of 1 / p over samples of p, where samples outside the region count as 0.
 
     Raises:
-        ValueError: a mixture without covariances.
+        ValueError: a mixture has no covariances.
     """
     rng = np.random.default_rng(seed)
     levels, volumes = np.empty(truth.shape[:2]), np.empty(truth.shape[:2])
@@ -332,15 +335,15 @@ def score(
     seed: int | np.random.Generator = 0,
     samples: int = SAMPLES,
 ) -> Scores:
-    """Scores of mixtures at T times.
+    """Score mixtures at T times.
 
     Args:
-        mixtures: (T,) of the same joints, relative to the origin.
+        mixtures: (T,) mixtures over positions of the same joints, relative to the origin.
         truth: (T, J, 3) true positions relative to the true origin, m.
-        names: (J,) of the joints.
+        names: (J,) names of the joints.
 
     Raises:
-        ValueError: no frames, or shapes that do not fit.
+        ValueError: there are no frames, or shapes do not match.
     """
     if len(mixtures) == 0 or truth.shape != (len(mixtures), len(names), 3):
         raise ValueError(

@@ -1,7 +1,7 @@
 """Scores of a track, which is a mixture at each of many times, against the true joint positions.
 
-Estimates are scored in batches as they come: memory does not grow with the length of the track.
-Estimate and truth belong together where their stamps are equal.
+Estimates are scored in batches as they arrive, so that memory for mixtures stays bounded. An
+estimate is compared with the truth of exactly its stamp.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from hmt_ros.evaluation.pose_scores import (
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.mixture import GaussianMixture
 
-# Fewer joints than this are no pose.
+# Minimum number of joints of a pose.
 _FEWEST_JOINTS = 4
-# Recorded joint positions agree with the kinematics of their body up to this distance, m.
+# Maximum distance of recorded joint positions from the kinematics of their body, m.
 _SAME_PLACE = 1e-3
 
 
@@ -39,14 +39,14 @@ class Truth:
     """True positions of the joints of a person.
 
     Attributes:
-        source: where the truth comes from, for messages.
-        joint_names: (J,).
+        source: source of the truth, for errors.
+        joint_names: (J,) names of the joints.
         joints: stamp in ns -> (J, 3) m, camera optical frame.
         frame_id: frame of the positions; '' if unknown.
-        ground: the true floor by stamp; empty: unknown.
+        ground: the true floor by stamp in ns; empty: unknown.
 
     Raises:
-        ValueError: no frames, or positions that do not fit the names or are not finite.
+        ValueError: there are no frames, or positions do not match the names or are not finite.
     """
 
     source: str
@@ -69,10 +69,10 @@ class Truth:
                 raise ValueError(f'{self.source}: joints at {stamp} ns are not finite')
 
     def evaluated_joints(self) -> tuple[str, ...]:
-        """The joints among `EVALUATED_JOINTS` that the truth has.
+        """Return the joints of `EVALUATED_JOINTS` that the truth has.
 
         Raises:
-            ValueError: fewer than four.
+            ValueError: there are fewer than four.
         """
         known = tuple(name for name in EVALUATED_JOINTS if name in self.joint_names)
         if len(known) < _FEWEST_JOINTS:
@@ -88,12 +88,12 @@ class Estimate:
     """A mixture over poses at one time, or the known part of it.
 
     Attributes:
-        stamp_ns: time of the poses.
-        weights: (K,) sum to 1.
-        mixture: over poses (d,); None without covariances.
-        positions: (K, J, 3) of the joints at the means, m; None if unknown.
-        joint_names: (J,) of `positions`.
-        body: the body that the poses are of; None if unknown.
+        stamp_ns: time of the poses, ns.
+        weights: (K,) weights; they sum to 1.
+        mixture: mixture over poses (d,); None without covariances.
+        positions: (K, J, 3) positions of the joints at the means, m; None if unknown.
+        joint_names: (J,) names of the joints in `positions`.
+        body: body of the poses; None if unknown.
     """
 
     stamp_ns: int
@@ -110,11 +110,11 @@ class TrackScores:
 
     Attributes:
         kind: kind of its mixtures, e.g. 'posterior'.
-        scores: of the frames with a truth.
+        scores: scores of the frames with a truth.
         missing: number of true frames without an estimate.
         without_truth: number of estimates without a truth.
-        note: why there are no densities; '' where there are.
-        ground: of the feet of the heaviest mode against the true floor; None: it is not known.
+        note: reason for missing densities; '' if none are missing.
+        ground: scores of the feet of the heaviest mode against the true floor; None if unknown.
     """
 
     kind: str
@@ -129,10 +129,10 @@ class TrackScorer:
     """Collects the estimates of a track and scores them in batches.
 
     Args:
-        model_sigma: standard deviation of a coordinate that is added to those published, m.
+        model_sigma: additional standard deviation of a coordinate, m.
 
     Attributes:
-        kind: kind of the mixtures, to be set by the reader of the track.
+        kind: kind of the mixtures; set by the reader of the track.
 
     Raises:
         ValueError: the truth has neither a pelvis nor both hips, or too few joints.
@@ -155,10 +155,10 @@ class TrackScorer:
         self._names: tuple[str, ...] = ()
 
     def take(self, estimate: Estimate) -> None:
-        """Takes an estimate that will not be revised; of several with one stamp the first counts.
+        """Adds a final estimate; of several with one stamp the first counts.
 
         Raises:
-            ValueError: it lacks joints of the truth.
+            ValueError: the estimate lacks joints of the truth.
         """
         if estimate.stamp_ns in self._seen:
             return
@@ -175,7 +175,7 @@ class TrackScorer:
             self._score_waiting()
 
     def take_window(self, estimates: Sequence[Estimate]) -> None:
-        """Takes the estimates of a window, by time; those of older windows hold before it.
+        """Adds the estimates of a window, by time; older estimates before it are final.
 
         Raises:
             ValueError: see `take`.
@@ -186,10 +186,10 @@ class TrackScorer:
         self._window.update((estimate.stamp_ns, estimate) for estimate in estimates)
 
     def finish(self) -> TrackScores:
-        """All scores.
+        """Return all scores.
 
         Raises:
-            ValueError: no estimate has a truth, or see `take`.
+            ValueError: no estimate has a truth; see also `take`.
         """
         for stamp in sorted(self._window):
             self.take(self._window[stamp])
@@ -212,7 +212,7 @@ class TrackScorer:
         )
 
     def _keep_heaviest(self, estimate: Estimate) -> None:
-        """Joint positions of the heaviest mode, for the scores of its feet."""
+        """Keeps the joint positions of the heaviest mode, for the scores of its feet."""
         rank = int(np.argmax(estimate.weights))
         if estimate.positions is not None:
             self._names = tuple(estimate.joint_names)
@@ -223,7 +223,7 @@ class TrackScorer:
             self._heaviest[estimate.stamp_ns] = estimate.body.joint_positions(means)[0]
 
     def _score_waiting(self) -> None:
-        """Scores the estimates that wait; they have the same body."""
+        """Scores the waiting estimates, which have the same body."""
         estimates, self._waiting = self._waiting, []
         if not estimates:
             return
@@ -261,7 +261,7 @@ class TrackScorer:
         self._parts.append(scores)
 
     def _bare(self, estimate: Estimate) -> JointMixture:
-        """Joint positions alone."""
+        """Return a mixture of joint positions without covariances."""
         if estimate.positions is None:
             raise ValueError(f'{self.name}: trajectories need the body, and the bag has none')
         try:
@@ -274,7 +274,7 @@ class TrackScorer:
 
 
 def _is_elsewhere(body: Body, estimate: Estimate) -> bool:
-    """Whether recorded joint positions are not those of the body."""
+    """Whether recorded joint positions differ from the kinematics of the body."""
     if estimate.positions is None or estimate.mixture is None:
         return False
     if estimate.joint_names != body.joint_names:
@@ -286,14 +286,14 @@ def _is_elsewhere(body: Body, estimate: Estimate) -> bool:
 def mode_errors(
     joints: Mapping[int, Array], names: Sequence[str], truth: Truth
 ) -> dict[int, Array]:
-    """Mean joint error (K,) of each mode, m, by stamp, where the truth is known.
+    """Compute the mean joint error (K,) of each mode, m, by stamp in ns, if the truth is known.
 
     Args:
-        joints: stamp in ns -> (K, J, 3) of the modes, m.
-        names: (J,) of the joints.
+        joints: stamp in ns -> (K, J, 3) joint positions of the modes, m.
+        names: (J,) names of the joints.
 
     Returns:
-        Nothing where modes and truth share no evaluated joints, or no origin.
+        The errors by stamp; empty if modes and truth share no evaluated joint, or no origin.
     """
     shared = [x for x in EVALUATED_JOINTS if x in truth.joint_names and x in names]
     origin = origin_joints(truth.joint_names, truth.source)

@@ -1,4 +1,4 @@
-"""Experts whose gates and covariances are calibrated on motions that they have not learned from.
+"""Experts whose gates and covariances are calibrated on held-out motions.
 
     p(x | r) ~ sum_i g_i(r)^(1 / T) N(x; f_i(r), c_i(r) s (O_i + E))
 
@@ -99,7 +99,7 @@ class CalibratedExperts(ConditionalDensity):
     @classmethod
     def _constructed(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
         own = part('model', arrays)
-        # Files could nest models without end.
+        # No nesting, because files could nest models without end.
         require(str(own['kind']) != cls.kind, 'a calibrated model inside a calibrated model')
         return cls(stored_model(own), **parameters_of(arrays))
 

@@ -107,7 +107,7 @@ class ConditionalDensity(ABC):
 
         Raises:
             ValueError: shapes are wrong, values are not finite, there are too few samples, or the
-                model only predicts, such as a network outside hmt_learning.
+                model can not learn, such as a network outside hmt_learning.
         """
         raise ValueError(f'{type(self).__name__} predicts only: it learns in hmt_learning')
 
@@ -194,8 +194,8 @@ class ConditionalDensity(ABC):
         """The model that `to_arrays` stored.
 
         Raises:
-            ValueError, KeyError, TypeError, IndexError: the kind or the version is another one, or
-                arrays are missing or wrong.
+            ValueError, KeyError, TypeError, IndexError: the kind or the version differs, or arrays
+                are missing or wrong.
         """
         check_header(arrays, cls.kind)
         inputs, outputs = (int(n) for n in arrays['shape'])
@@ -214,7 +214,7 @@ class ConditionalDensity(ABC):
         """Writes the model into an .npz file and returns its path.
 
         Args:
-            card: what it was learned from, licence, method; JSON must be able to hold it.
+            card: training data, licence and method, serialisable as JSON.
         """
         self._check_learned()
         example = standard_normals(np.random.default_rng(0), (self.n_inputs_,))
@@ -225,8 +225,8 @@ class ConditionalDensity(ABC):
         """Reads a model that `save` wrote.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: the file is no model, or one of another version or kind, or a wrong one.
+            FileNotFoundError: the file does not exist.
+            ValueError: the file is not a model, has another version or kind, or is invalid.
         """
         return read_model(path, cls.kind, cls.from_arrays)
 
@@ -235,7 +235,7 @@ class ConditionalDensity(ABC):
         return self.predict(given[None])[0]
 
     def _check_components(self) -> None:
-        """Raises ValueError if predictions do not fit each other, are none, or are too large."""
+        """Raise ValueError if predictions are inconsistent, invalid or too large."""
         inputs, d = np.eye(2, self.n_inputs_), self.n_outputs_
         found = self.components(inputs)
         m, parts = found.log_weights.shape[-1], [*vars(found).values()]
@@ -276,7 +276,7 @@ class ConditionalDensity(ABC):
 
 
 def stored_model(arrays: Mapping[str, NDArray[Any]]) -> ConditionalDensity:
-    """The model that `ConditionalDensity.to_arrays` stored, of the kind that the arrays name.
+    """Build the model that `ConditionalDensity.to_arrays` stored, of the kind in the arrays.
 
     Raises:
         ValueError, KeyError, TypeError, IndexError: the kind is unknown, or arrays are missing or

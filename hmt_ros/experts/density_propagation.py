@@ -25,8 +25,7 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import product
 from hmt_ros.inference.reduction import reduced
 
-# Minimum of `ConditionalDensity.support`: below it no kernel fires, the experts have seen nothing
-# like the input.
+# Minimum of `ConditionalDensity.support`; below it, the input is unlike all training data.
 LEAST_SUPPORT = 1e-3
 
 

@@ -28,7 +28,7 @@ from hmt_ros.inference.arrays import Array, Index
 # An expert from its weighted sums and its previous state.
 Learner = Callable[[WeightedSums, SparseRegression | None], SparseRegression]
 
-# An expert with fewer samples than this is empty; the largest one never is.
+# Number of samples below which an expert is empty; the largest expert is never empty.
 LEAST_SAMPLES = 2.0
 
 
@@ -49,7 +49,7 @@ class EMState:
     bound: float
 
     def without_others(self, kept: Index) -> EMState:
-        """The state with some of the experts."""
+        """Return the state with some of the experts."""
         experts = tuple(self.experts[int(i)] for i in kept)
         return EMState(experts, self.gates.of_experts(kept), self.gate_features, -np.inf)
 

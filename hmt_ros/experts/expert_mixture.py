@@ -6,8 +6,8 @@
 is a sparse Bayesian regression, the baseline with a single mode (BME 3). All are learned by
 `expectation_maximisation`.
 
-Several starts, each with all candidate kernel widths, run for a few iterations on some of the
-samples; the one with the highest bound continues with all samples.
+Several starts, each with all candidate kernel widths, run for a few iterations on a subset of the
+samples; the start with the highest bound continues with all samples.
 """
 
 from __future__ import annotations
@@ -55,14 +55,14 @@ if TYPE_CHECKING:
 
 # Candidate kernel widths, in typical distances between inputs.
 WIDTHS = (0.5, 1.0, 2.0)
-# Iterations of a start in each round of the choice, and samples that it sees.
+# Iterations of a start in each round of the selection, and maximum number of its samples.
 TRIAL_ITERATIONS = (2, 4, 8)
 TRIAL_SAMPLES = 1000
-# Share of the targets' variance that the prior of the noise pulls to.
+# Noise variance preferred by the prior, over the targets' variance.
 NOISE_FLOOR = 1e-2
 # Maximum numbers of experts, and of functions of an expert, in a file.
 MOST_EXPERTS, MOST_ACTIVE = 1000, 2000
-# Rounding of covariances of weights, which span many orders of magnitude, in their correlations.
+# Rounding error of the correlations of weights, whose covariances span many orders of magnitude.
 SEMIDEFINITE = 1e-6
 
 
@@ -74,7 +74,7 @@ class ExpertMixture(ConditionalDensity):
         basis: Basis functions of experts and gates: 'linear' or 'rbf' (Gaussian kernels).
         width: Width of the kernels, in scaled inputs; None chooses among candidates.
         max_kernels: Maximum number of candidate kernels, spread over the training inputs.
-        n_starts: Number of starts of the iterations, for each width.
+        n_starts: Number of starts of EM for each width.
         tolerance: Gain of an iteration below which EM ends, nats per sample.
         scaling: Scaling of inputs before distances are taken; see `Standardisation.of`.
 
@@ -119,10 +119,11 @@ class ExpertMixture(ConditionalDensity):
     def fit(
         self, inputs: ArrayLike, targets: ArrayLike, sample_weight: ArrayLike | None = None
     ) -> Self:
-        """Learns from inputs (N, p) and targets (N, D).
+        """Fit the model to inputs (N, p) and targets (N, D).
 
         Args:
-            sample_weight: (N,) not negative; a sample of weight 2 counts like two equal samples.
+            sample_weight: (N,) nonnegative weights; a sample of weight 2 counts as two equal
+                samples.
 
         Raises:
             ValueError: shapes are wrong, values are not finite, there are fewer samples than
@@ -145,7 +146,7 @@ class ExpertMixture(ConditionalDensity):
         return self
 
     def components(self, inputs: ArrayLike) -> Components:
-        """The mixtures at inputs (n, p)."""
+        """Return the mixtures at inputs (n, p)."""
         points = self._checked(inputs)
         features = self.basis_.evaluate(points)
         scores = self.gates_.log_scores(self.gates_.features(points))
@@ -184,7 +185,7 @@ class ExpertMixture(ConditionalDensity):
         require(right, f'width is {self.width}, wanted a positive number or None')
 
     def _bases(self, pairs: TrainingPairs) -> list[Basis]:
-        """The candidate basis functions, for each candidate width."""
+        """Return the candidate basis functions for each candidate width."""
         if self.basis == 'linear':
             return [LinearBasis(self._scaling)]
         rng = np.random.default_rng(self.seed)
@@ -202,14 +203,14 @@ class ExpertMixture(ConditionalDensity):
     def _begin(
         self, pairs: TrainingPairs, basis: Basis, first: Array
     ) -> tuple[TrainingPairs, EMState]:
-        """The features, and the state after an M-step from the first responsibilities."""
+        """Return the features, and the state after an M-step from the first responsibilities."""
         gates = self._gates.first(self.n_experts, basis, pairs, self._scaling)
         features = self._features(pairs, basis)
         state = EMState((), gates, gates.features(pairs.inputs), -np.inf)
         return features, m_step(features, state, first, self._expert)
 
     def _best_start(self, pairs: TrainingPairs) -> tuple[Basis, TrainingPairs, EMState]:
-        """The start with the highest bound after a few iterations."""
+        """Return the start with the highest bound after a few iterations."""
         rng = np.random.default_rng(self.seed)
         some = pairs
         if len(pairs) > TRIAL_SAMPLES:
@@ -237,7 +238,7 @@ class ExpertMixture(ConditionalDensity):
     def _first_responsibilities(
         self, pairs: TrainingPairs, number: int, rng: np.random.Generator
     ) -> Array:
-        """Responsibilities (N, M) from clusters of inputs and targets, weighted by the start."""
+        """Return responsibilities (N, M) from clusters of inputs and targets, weighted by start."""
         inputs = self._scaling.apply(pairs.inputs)
         targets = self._target_scaling.apply(pairs.targets)
         share = (0.5, 0.7, 0.9, 0.3)[number % 4]
@@ -258,7 +259,7 @@ class ExpertMixture(ConditionalDensity):
     # Predictions and files.
 
     def _keep_used(self) -> None:
-        """Drops kernels that no expert uses, and prepares predictions."""
+        """Drop kernels that no expert uses, and prepare predictions."""
         if isinstance(self.basis_, RadialBasis):
             self._candidates = self.basis_.centres
             used = np.unique(np.concatenate([one.active for one in self.experts_] + [[0]]))
@@ -339,7 +340,7 @@ class JointExperts(ExpertMixture):
 
 
 def _stored_expert(own: Mapping[str, NDArray[Any]]) -> SparseRegression:
-    """The regression in a file; raises ValueError if its functions or covariances are none."""
+    """Read a regression; raises ValueError if its functions or covariances are invalid."""
     active, covariance = own['active'], own['covariance']
     m = len(active)
     different = m == len(np.unique(active)) <= MOST_ACTIVE and (active >= 0).all()

@@ -1,10 +1,10 @@
 """Gates: the probability that an expert is responsible for an input (BME 2.2.2 and 2.2.3).
 
-`SoftmaxGates` model the choice alone:
+`SoftmaxGates` model only the choice of an expert:
 
     g(r) = softmax(V phi(r)),    V_ik ~ N(0, 1 / b_k),    b_k ~ Gamma(A, B)         (BME 16)
 
-`GaussianGates` model where the inputs of each expert lie:
+`GaussianGates` model the density of each expert's inputs:
 
     g_i(r) = a_i N(r; m_i, C_i) / sum_j a_j N(r; m_j, C_j)                          (BME 32)
 
@@ -12,7 +12,7 @@ Both learn from responsibilities h (N, M) and never lower
 
     sum_n s_n sum_i h_ni log g_i(r_n) + penalty
 
-which is their share of the bound that EM raises. The penalty of the softmax is its log prior and
+which is their part of the bound that EM raises. The penalty of the softmax is its log prior and
 the Laplace approximation of the integral over V; that of the Gaussians is an inverse Wishart prior.
 """
 
@@ -41,13 +41,13 @@ from hmt_ros.inference.linear_algebra import inverse_triangular, product
 
 # Gamma hyperprior of precisions: shape and rate (BME 2.2.2).
 SHAPE, RATE = 1e-2, 1e-4
-# Lower bound of precisions: a gate that may become ever sharper would never converge.
+# Lower bound of precisions; without it, a gate that grows ever sharper would never converge.
 LEAST_PRECISION = 1e-5
-# A function that determines less than this share of a parameter may be pruned.
+# Effective number of parameters, over M, below which a function may be pruned.
 USELESS = 0.05
 DAMPING_LIMIT = 1e10
 NEWTON_STEPS = 3  # between two E-steps; the next M-step continues from there
-# Kernels of new softmax gates: at most this many, and at most one for this many samples.
+# Maximum number of kernels of new softmax gates; number of samples per kernel.
 GATE_KERNELS, SAMPLES_PER_KERNEL = 60, 15
 
 
@@ -71,7 +71,7 @@ class SoftmaxGates:
     def first(
         cls, experts: int, basis: Basis, pairs: TrainingPairs, scaling: Standardisation
     ) -> SoftmaxGates:
-        """Equal gates of M experts, before learning, over some kernels of the experts' basis."""
+        """Return equal gates of M experts, before learning, over kernels of the experts' basis."""
         if experts == 1:
             basis = LinearBasis(scaling)
         elif isinstance(basis, RadialBasis):
@@ -91,7 +91,7 @@ class SoftmaxGates:
     def learned(
         self, features: Array, responsibilities: Array, sample_weights: Array
     ) -> tuple[SoftmaxGates, Array]:
-        """Improved gates, and the features (n, K') that remain after pruning."""
+        """Return improved gates, and the features (n, K') that remain after pruning."""
         if len(self.weights) == 1:
             return replace(self, penalty=0.0), features
         problem = _Softmax(features, responsibilities * sample_weights[:, None], sample_weights)
@@ -122,17 +122,17 @@ class SoftmaxGates:
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> SoftmaxGates:
-        """The gates that `arrays` describes."""
+        """Build the gates from `arrays`."""
         basis = basis_of(part('basis', arrays))
         return cls(basis, arrays['weights'], arrays['precisions'], 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class _SoftmaxFit:
-    """Weights with their precisions, and their share of the bound.
+    """Weights with their precisions, and their part of the bound.
 
     Attributes:
-        value: Share of the bound, nats.
+        value: Part of the bound, nats.
         penalty: Part of the value that does not depend on the responsibilities, nats.
         determined: (K,) effective number of parameters of each function, 0 to M.
     """
@@ -144,7 +144,7 @@ class _SoftmaxFit:
     determined: Array
 
     def better_precisions(self) -> Array:
-        """MacKay's fixed point with the hyperprior."""
+        """Update the precisions by MacKay's fixed point with the hyperprior."""
         determined = np.maximum(self.determined, 0.0)
         precisions = (determined + 2.0 * SHAPE) / ((self.weights**2).sum(0) + 2.0 * RATE)
         return np.asarray(np.maximum(precisions, LEAST_PRECISION))
@@ -172,7 +172,7 @@ class _Softmax:
     def curvature(self, gates: Array) -> Array:
         """Minus the Hessian of the likelihood, (M K, M K)."""
         experts, count = gates.shape[1], self.features.shape[1]
-        # sum_n s (diag(g) - g g') x (phi phi'), the second part as one product with itself.
+        # sum_n s (diag(g) - g g') x (phi phi'); the second term is one matrix times its transpose.
         shared = (np.sqrt(self.sample_weights)[:, None] * gates)[:, :, None]
         shared = (shared * self.features[:, None]).reshape(len(gates), experts * count)
         result: Array = -(shared.T @ shared)
@@ -183,11 +183,11 @@ class _Softmax:
         return result
 
     def settled(self, weights: Array, precisions: Array) -> _SoftmaxFit:
-        """The fit after some Newton steps."""
+        """Return the fit after some Newton steps."""
         return self.laplace(self.newton(weights, precisions, NEWTON_STEPS), precisions)
 
     def newton(self, weights: Array, precisions: Array, steps: int) -> Array:
-        """Damped Newton steps; the ratio of true to predicted gain sets the damping."""
+        """Take damped Newton steps; the ratio of true to predicted gain sets the damping."""
         shape = weights.shape
         prior = np.tile(precisions, shape[0])
         likelihood, gates = self.likelihood(weights)
@@ -222,7 +222,7 @@ class _Softmax:
         return weights
 
     def laplace(self, weights: Array, precisions: Array) -> _SoftmaxFit:
-        """The share of the bound, with a Laplace approximation at the weights."""
+        """Compute the part of the bound, with a Laplace approximation at the weights."""
         experts, count = weights.shape
         likelihood, gates = self.likelihood(weights)
         hessian = self.curvature(gates)
@@ -242,7 +242,7 @@ class _Softmax:
 
 @dataclass(frozen=True, eq=False)
 class GaussianGates:
-    """Where the inputs of each expert lie.
+    """Gaussian density of the inputs of each expert.
 
     Attributes:
         standardisation: Maps inputs r to z.
@@ -250,7 +250,7 @@ class GaussianGates:
         means: (M, p) m, standardised.
         covariances: (M, p, p) C, standardised.
         strength: Strength of the prior of C, in samples.
-        target: (p, p) covariance that the prior pulls to.
+        target: (p, p) covariance preferred by the prior.
         penalty: Share of the bound that does not depend on the responsibilities, nats.
     """
 
@@ -278,7 +278,7 @@ class GaussianGates:
         share = pairs.weights / pairs.weights.sum()
         z = scaling.apply(pairs.inputs)
         variances = np.maximum(share @ (z - share @ z) ** 2, 1e-6)
-        # Experts divide the space of inputs between them.
+        # M experts divide the input space, so each covers 1/M of its volume.
         target = np.diag(variances) * experts ** (-2.0 / p)
         return cls(
             scaling,
@@ -307,7 +307,7 @@ class GaussianGates:
     def learned(
         self, features: Array, responsibilities: Array, sample_weights: Array
     ) -> tuple[GaussianGates, Array]:
-        """Weighted shares, means and covariances, the latter with their prior.
+        """Estimate weighted shares, means and covariances, the latter with their prior.
 
         a_i = sum_n h_ni / N                                                    (BME 45)
         m_i = sum_n h_ni r_n / sum_n h_ni                                       (BME 46)
@@ -351,7 +351,7 @@ class GaussianGates:
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> GaussianGates:
-        """The gates that `arrays` describes; raises ValueError if covariances are none."""
+        """Build the gates from `arrays`; raises ValueError if covariances are invalid."""
         check_covariances('the covariances of gates', arrays['covariances'])
         return cls(
             basis_of(part('basis', arrays)).standardisation,

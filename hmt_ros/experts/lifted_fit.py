@@ -1,4 +1,4 @@
-"""Poses of a body that have lifted joints: each component of a mixture becomes a Gaussian.
+"""Poses of a body fitted to lifted joints: each mixture component becomes a Gaussian.
 
     E(x) = 1/2 sum_ja ((a' (J_j(x) - t) - m_ja) / s_ja)^2 + 1/2 sum_l |A_l P_l(x)|^2 / n_l^2
            + E_prior(x)
@@ -7,7 +7,7 @@ J_j is joint j of the pose x, a the axes of the person's view, t the middle of t
 landmark l, A_l the projection across the ray of its keypoint, whose noise is n_l. A closed form
 gives the start (`body.limb_angles`); linear least squares place it where the landmarks are seen;
 Newton's method within the limits gives the minimum, its Hessian the covariance. The distance of the
-person hardly shows: the spread of people's size is added along the line of sight.
+person is hardly observable, so the spread of people's size is added along the line of sight.
 """
 
 from __future__ import annotations
@@ -34,26 +34,27 @@ from hmt_ros.inference.energy import Energy, EnergyFunction, add_energies
 from hmt_ros.inference.linear_algebra import inverse, product, solve
 from hmt_ros.inference.mixture import GaussianMixture
 
-# Where the hips are until they are placed, m before the camera.
+# Position of the hips until they are placed, camera frame, m.
 AWAY = np.array([0.0, 0.0, 5.0])
-# Weight of the prior of the body, for angles that lifted joints leave open, such as twists.
+# Weight of the body's prior, for angles that lifted joints do not determine, such as twists.
 PRIOR_WEIGHT = 0.3
 ITERATIONS, TOLERANCE = 12, 0.05
 # Factor on deviations across the line of sight, which the keypoints themselves show, and scale of
 # the robust kernel of these, in standard deviations.
 ACROSS, KERNEL = 4.0, 4.0
-# Deviation of a landmark from its keypoint, m at the person, for the place of the person.
+# Standard deviation of a landmark from its keypoint when the person is placed, m at the person.
 SEEN = 0.03
-# Factors on covariances: keypoints and joints err together, and so do joints of a person of other
-# lengths. Chosen on clips: regions of 90 % of single joints hold 88 %, of other lengths 80 %.
+# Factors on covariances, for correlated errors of keypoints and joints, and of joints of a person
+# of other lengths. Chosen on clips: regions of 90 % of single joints hold 88 %, of other lengths 80
+# %.
 TOGETHER, OF_LENGTHS = 4.0, 1.6
 # Relative standard deviation of the size of a person.
 KNOWN_SIZE, UNKNOWN_SIZE = 0.02, 0.06
-# Probabilities that a detector calls nothing, all, arms or legs by the other side throughout a
-# window. It does in 5, 3 and 3 % of the images of clips, but in up to half of those of one person;
-# chosen so that regions of 90 % of such people hold 80 %.
+# Probabilities that a detector exchanges the sides of nothing, all, arms or legs throughout a
+# window. The latter three happen in 5, 3 and 3 % of the images of clips, but in up to half of the
+# images of some people; chosen so that 90 % regions of such people have a coverage of 80 %.
 EXCHANGE_SHARES = np.array([0.8, 0.1, 0.05, 0.05])
-# A person is at least this far away, m.
+# Minimum distance of a person, m.
 NEAREST = 0.4
 
 
@@ -69,22 +70,22 @@ def lift_poses(
     causal: bool = False,
     scheme: str = AUTO,
 ) -> list[GaussianMixture | None]:
-    """Mixtures over poses from the keypoints of a sequence, without any image.
+    """Estimate mixtures over poses from the keypoints of a sequence, without images.
 
     Args:
         body: of the person, with the lengths as far as they are known.
-        camera: that saw the keypoints, and stood still.
+        camera: static camera of the keypoints.
         stamps: (T,) times of the images, increasing, s.
         ups: (T, 3) unit vectors against gravity, camera frame; None: unknown.
         lengths_known: whether the lengths of the body are those of the person.
-        causal: whether images after each do not count.
-        scheme: of the keypoints' names, see `keypoint_schemes`.
+        causal: whether images after each time are left out.
+        scheme: scheme of the keypoints' names, see `keypoint_schemes`.
 
     Returns:
         T mixtures, heaviest first; None where fewer than five landmarks are seen.
 
     Raises:
-        ValueError: there is no such scheme, or the body lacks joints.
+        ValueError: the scheme is unknown, or the body lacks joints.
     """
     seen = [landmark_rays(camera, one, scheme) for one in keypoints]
     rays, confidences = (np.array([one[i] for one in seen]) for i in range(2))
@@ -115,7 +116,7 @@ def poses_of(
     confidences: Array,
     size_spread: float,
 ) -> list[GaussianMixture]:
-    """Mixtures over poses of a body that has the joints of lifted poses.
+    """Convert mixtures over lifted joints to mixtures over poses of a body.
 
     Args:
         body: of the person, with lengths as far as they are known.
@@ -235,7 +236,7 @@ def _marks(body: Body) -> tuple[Index, Array]:
 
 
 class KeypointPredictor:
-    """Predicts mixtures over the poses of one person, as images come; see `lift_poses`.
+    """Predicts mixtures over the poses of one person, image by image; see `lift_poses`.
 
     Args:
         body: of the person, with the lengths as far as they are known.
@@ -255,11 +256,11 @@ class KeypointPredictor:
         self.newest = -math.inf
 
     def add(self, keypoints: Keypoints, stamp: float) -> None:
-        """Takes the keypoints of the next image, of a time in s that is later than those before."""
+        """Add the keypoints of the next image, at a time in s later than those before."""
         self._shown, self.newest = self._history.add(keypoints, stamp), stamp
 
     def predict(self, up: Array | None = None) -> GaussianMixture | None:
-        """The mixture at the newest image, heaviest first; None: nobody is seen.
+        """Predict the mixture at the newest image, heaviest first; None if no person is seen.
 
         Args:
             up: (3,) unit vector against gravity, camera frame; None: unknown.

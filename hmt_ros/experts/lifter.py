@@ -2,19 +2,19 @@
 
     p(y | r) = sum_i g_i(r) N(y; f_i(r), diag s_i(r)^2)
 
-y are the joints of a person of usual lengths, from the middle of the hips, along the axes of a
-camera that looks at the person; r is a window of keypoints. Gates g, means f and deviations s are
-one network with shared layers [Bishop 1994], learned from motion capture seen by cameras and a
-detector that errs as real ones do (`keypoint_training`).
+y are the joints of a person of usual lengths, relative to the middle of the hips, along the axes of
+a camera that looks at the person; r is a window of keypoints. Gates g, means f and deviations s are
+one network with shared layers [Bishop 1994], learned from motion capture with simulated cameras and
+detector errors (`keypoint_training`).
 
     keypoints -> landmarks of all schemes -> rays -> the view of a camera that looks at the trunk
 
-A window has a place for each of `TIMES`, relative to the image that is asked for; the nearest image
-fills it, if it is near enough, so that any frame rate fits. Its inputs are the places of the
-landmarks in the plane of a camera that looks at the trunk, over their extent, with confidences, how
-far each image is from its time, the extent, the direction against gravity in that camera, and the
-proportions of the person, as far as both are known. That camera is turned about its axis until it
-stands upright, as far as gravity is known: the experts have seen no other.
+A window has a slot for each of `TIMES`, relative to the image of the estimate; the nearest image
+fills it if it is near enough, so that any frame rate works. The inputs are the positions of the
+landmarks in the plane of a camera that looks at the trunk, divided by their extent, with
+confidences; the offset of each image from its time; the extent; and, where known, the direction
+against gravity in that camera and the proportions of the person. Where gravity is known, that
+camera is rolled upright, because the experts were trained on upright cameras only.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ from hmt_ros.inference.linear_algebra import product
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.inference.random_numbers import standard_normals
 
-# Times of a window relative to now, s, and how far an image may be from each.
+# Times of a window relative to its image, s, and the largest offset of an image from each, s.
 TIMES = np.array([0.0, -0.067, -0.15, -0.3, -0.5, -0.8, 0.067, 0.15, 0.3, 0.5, 0.8])
 NEAR = np.array([0.02, *([0.045, 0.06, 0.09, 0.12, 0.17] * 2)])
 
@@ -74,7 +74,7 @@ LANDMARKS = (
     'mid_hip',
     'centre_of_head',
 )
-# Names in schemes of joint centres, in the place of landmarks on the skin.
+# Landmark that replaces each joint centre of other keypoint schemes.
 INSTEAD = {
     **{
         f'centre_of_{side}_{name}': f'{side}_{name}'
@@ -92,7 +92,7 @@ TRUNK = np.array(
 )
 # Joints of our bodies that may name a keypoint without a scheme.
 OF_JOINTS = {'pelvis': 'mid_hip', 'neck': 'neck_base', 'head': 'centre_of_head'}
-# Lengths of a person whose proportions are inputs; a rise of the shoulders has none.
+# Lengths whose proportions are inputs; the rise of the shoulders is not among them.
 PROPORTIONED = (
     'thigh',
     'shin',
@@ -106,15 +106,15 @@ PROPORTIONED = (
     'trunk',
     'neck_to_head',
 )
-# A length counts as at least this share of the usual one.
+# Minimum ratio of a length to the usual one; smaller ratios are clipped.
 SHORTEST = 0.3
-# Number of components that remain of a mixture over exchanges of sides.
+# Maximum number of components of a mixture over exchanges of sides.
 MOST = 12
-# A keypoint of less confidence is not looked at; fewer landmarks are no person.
+# Minimum confidence of a keypoint that is used; minimum number of landmarks of a person.
 LEAST_CONFIDENCE, FEWEST = 0.02, 5
-# Length of the inputs of a window.
+# Number of inputs of a window.
 INPUTS = len(TIMES) * (3 * len(LANDMARKS) + 2) + 5 + len(PROPORTIONED) + 1
-# Landmarks (E, L) in the place of each one under each exchange of `terms.keypoints.EXCHANGED`.
+# Landmark (E, L) that replaces each one under each exchange of `terms.keypoints.EXCHANGED`.
 _ARM, _LEG = ('shoulder', 'elbow', 'wrist'), ('hip', 'knee', 'ankle', 'heel', 'toe')
 _GROUPS = [ARMS if x.endswith(_ARM) else LEGS if x.endswith(_LEG) else CENTRE for x in LANDMARKS]
 EXCHANGES = np.where(
@@ -131,7 +131,7 @@ class WindowInputs:
     Attributes:
         values: (N, p) inputs of the experts.
         axes: (N, 3, 3) axes of the cameras that look at the persons, in rows, camera frame.
-        known: (N,) windows in which a person is seen now.
+        known: (N,) whether a person is seen in the image of the window.
     """
 
     values: NDArray[np.float32]
@@ -144,7 +144,7 @@ def log_ratios(usual: Body, lengths: Mapping[str, float]) -> Array:
 
     Args:
         usual: body with the usual lengths.
-        lengths: of the person by name, m.
+        lengths: lengths of the person by name, m.
     """
     own = usual.segment_lengths
     return np.asarray(
@@ -153,7 +153,7 @@ def log_ratios(usual: Body, lengths: Mapping[str, float]) -> Array:
 
 
 def relative(usual: Body, logs: Array) -> Array:
-    """Log ratios (..., P) less their mean, which is a person's size."""
+    """Subtract from log ratios (..., P) their weighted mean, which is the person's size."""
     weights = np.array([usual.segment_lengths[name] for name in PROPORTIONED])
     return np.asarray(logs - product(logs, weights)[..., None] / weights.sum())
 
@@ -164,14 +164,14 @@ def proportions(usual: Body, lengths: Mapping[str, float]) -> Array:
 
 
 def places_of(keypoints: Keypoints, scheme: str = AUTO) -> list[int]:
-    """The landmark (row of `LANDMARKS`) that each keypoint shows; -1: none.
+    """Return the landmark (row of `LANDMARKS`) that each keypoint shows; -1 if none.
 
     Args:
-        keypoints: of a detector, or named for a body.
-        scheme: of names that are a detector's, see `keypoint_schemes.scheme_of`.
+        keypoints: keypoints of a detector, or with the joint names of a body.
+        scheme: keypoint scheme of the detector; see `keypoint_schemes.scheme_of`.
 
     Raises:
-        ValueError: there is no such scheme.
+        ValueError: the scheme is unknown.
     """
     called = keypoints.landmarks
     if called is None:
@@ -186,7 +186,7 @@ def places_of(keypoints: Keypoints, scheme: str = AUTO) -> list[int]:
 
 
 def landmark_offsets(body: Body, names: Sequence[str] = LANDMARKS) -> tuple[list[str], Array]:
-    """The joint that each of L landmarks is at, and its offset (L, 3) in the segment's frame, m."""
+    """Return the joint of each of L landmarks, and offsets (L, 3) in the segment's frame, m."""
     size = body.stature / USUAL_STATURE
     marks = [landmarks()[name] for name in names]
     return [mark.joint for mark in marks], size * np.array([mark.offset for mark in marks])
@@ -195,12 +195,12 @@ def landmark_offsets(body: Body, names: Sequence[str] = LANDMARKS) -> tuple[list
 def filled(
     stamps: Array, at: Array, *, causal: bool
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_], Array]:
-    """The images that fill windows.
+    """Select the images that fill windows.
 
     Args:
         stamps: (T,) times of the images, increasing, s.
         at: (N,) times of the windows, s.
-        causal: whether images after those of the windows do not count.
+        causal: whether images after the time of a window are left out.
 
     Returns:
         (N, S) rows of the images, (N, S) whether they are near enough, (N, S) their times relative
@@ -225,9 +225,10 @@ def window_inputs(
     """Inputs of N windows of S images with L landmarks.
 
     Args:
-        rays: (N, S, L, 2) x / z and y / z of the rays of the landmarks; any without a landmark.
-        confidences: (N, S, L) from 0, not seen, to 1.
-        times: (N, S) of the images relative to now, s.
+        rays: (N, S, L, 2) x / z and y / z of the rays of the landmarks; arbitrary where the
+            confidence is 0.
+        confidences: (N, S, L) confidences from 0 (not seen) to 1.
+        times: (N, S) times of the images relative to that of the window, s.
         ups: (N, 3) unit vectors against gravity, camera frame; 0: unknown.
         persons: (N, len(PROPORTIONED)) proportions of the persons; 0: unknown.
     """
@@ -248,7 +249,7 @@ def window_inputs(
 
 
 def _exchanged_inputs(order: Index) -> Index:
-    """Inputs (p,) that stand in the place of each where landmarks (L,) stand for one another."""
+    """Return the permutation (p,) of the inputs for a permutation (L,) of the landmarks."""
     s, count = len(TIMES), len(LANDMARKS)
     places = np.arange(2 * s * count).reshape(s, count, 2)[:, order].ravel()
     confidences = np.arange(2 * s * count, 3 * s * count).reshape(s, count)[:, order].ravel()
@@ -261,9 +262,9 @@ FOLDER = Path(__file__).resolve().parent / 'models'
 SHIPPED = 'keypoints'
 KIND = 'lifter'
 
-# Earliest time of a window, s. Least z of a ray: one from beside the camera says little.
+# Earliest time of a window, s. Minimum z of a ray: rays from beside the camera carry little.
 EARLIEST, BEFORE = float((TIMES - NEAR).min()), 0.1
-# Standard deviation with which a keypoint is not looked at, m at the person.
+# Standard deviation above which a keypoint is ignored, m at the person.
 ANYWHERE = 0.15
 
 
@@ -274,7 +275,7 @@ class Network(Layers):
     The numbers after the layers are those of K + 6 J K: gates, means and log deviations.
 
     Attributes:
-        mean, scale: (p,) of the inputs.
+        mean, scale: (p,) mean and scale of the inputs.
         middle: (J, 3) origin of the means, m.
     """
 
@@ -293,11 +294,11 @@ class Network(Layers):
         return log_softmax(gates), MEANS * means + self.middle, deviations
 
     def whitened(self, inputs: Floats) -> Floats:
-        """Inputs (N, p) as the layers take them."""
+        """Return inputs (N, p) with zero mean and unit scale, for the layers."""
         return np.asarray((inputs - self.mean) / self.scale)
 
 
-# Scale of the means, m; log of the usual deviation, and its limits, log m.
+# Scale of the means, m; log of the usual deviation, and the limits of the log, log m.
 MEANS, SPREAD, SPREADS = 0.3, -2.5, (-5.0, 1.0)
 
 
@@ -306,7 +307,7 @@ class Lifter:
 
     Args:
         usual: body with the usual lengths, to which the joints belong.
-        notes: card of its file; JSON must be able to hold it.
+        notes: card of the file, serialisable as JSON.
     """
 
     def __init__(
@@ -321,7 +322,7 @@ class Lifter:
         self.notes = dict(notes or {})
 
     def proportions(self, body: Body) -> Array | None:
-        """Proportions of a person, as inputs of a window; None: the body lacks some lengths."""
+        """Return a person's proportions for a window, or None if the body lacks some lengths."""
         lengths = body.segment_lengths
         known = lengths.keys() >= {*PROPORTIONED}
         return proportions(self.usual, lengths) if known else None
@@ -338,20 +339,21 @@ class Lifter:
         causal: bool,
         exchanges: Array | None = None,
     ) -> list[LiftedPoses | None]:
-        """The mixtures at N times; None where nobody is seen.
+        """Predict the mixtures at N times; None where no person is seen.
 
-        With `exchanges`, sum_e P(e) p(y | r with the sides exchanged by e): a person whose sides a
-        detector exchanges looks like one who faces the other way, so that the window can not tell.
+        With `exchanges`, sum_e P(e) p(y | r with the sides exchanged by e): when a detector
+        exchanges the sides, the person looks as if facing the other way, and the window can not
+        decide which.
 
         Args:
             stamps: (T,) times of the images, increasing, s.
-            rays, confidences: (T, L, 2), (T, L) of the landmarks, see `landmark_rays`.
-            at: (N,) times of images, s.
+            rays, confidences: (T, L, 2) and (T, L), see `landmark_rays`.
+            at: (N,) times of the estimates, s.
             ups: (N, 3) unit vectors against gravity, camera frame; None: unknown.
             person: proportions of the person; None: unknown.
-            causal: whether images after those times do not count.
-            exchanges: (E,) probabilities of `EXCHANGES`, of which the `MOST` heaviest components
-                remain; None: the keypoints are called by their sides.
+            causal: whether images after those times are left out.
+            exchanges: (E,) probabilities of `EXCHANGES`; the `MOST` heaviest components are kept.
+                None: the sides of the keypoints are right.
         """
         rows, there, times = filled(stamps, at, causal=causal)
         n = len(at)
@@ -384,7 +386,7 @@ class Lifter:
         return log_softmax(gates[kept]), means[kept], deviations[kept]
 
     def to_arrays(self) -> Arrays:
-        """The arrays of a file, with half precision."""
+        """Return the arrays of a file; those of the network have half precision."""
         parameters = {
             'joints': list(self.joints),
             'landmarks': list(LANDMARKS),
@@ -395,7 +397,7 @@ class Lifter:
 
     @classmethod
     def from_arrays(cls, arrays: Arrays) -> Lifter:
-        """The lifter that `to_arrays` and a card describe.
+        """Build the lifter that `to_arrays` and a card describe.
 
         Raises:
             ValueError, LookupError, TypeError: arrays or parameters are missing, or wrong.
@@ -413,13 +415,13 @@ class Lifter:
         return cls(network, joints, body_of(parameters), card)
 
     def answer(self, given: Array) -> GaussianMixture:
-        """The mixture over joints, (3 J,), for the inputs (p,) of a window."""
+        """Return the mixture over joints, (3 J,), for the inputs (p,) of a window."""
         gates, means, deviations = (x[0] for x in self.network(given[None].astype(np.float32)))
         spread = deviations.reshape(len(gates), -1, 1) ** 2 * np.eye(3 * len(self.joints))
         return GaussianMixture(elementary.exp(gates), means.reshape(len(gates), -1), spread)
 
     def save(self, path: str | Path) -> Path:
-        """Writes the lifter into an .npz file, with its notes as the card; returns its path."""
+        """Write the lifter to an .npz file, with its notes as the card, and return its path."""
         drawn = standard_normals(np.random.default_rng(0), (INPUTS,))
         example = self.network.mean + self.network.scale * drawn
         return write_model(path, self, self.from_arrays, self.notes, example)
@@ -429,31 +431,31 @@ class Lifter:
         """Reads a lifter that `save` wrote.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: the file is no lifter, or one of another version, or a wrong one.
+            FileNotFoundError: the file does not exist.
+            ValueError: the file is not a lifter, has another version, or is invalid.
         """
         return read_model(path, KIND, cls.from_arrays)
 
 
 def load_lifter(model: str = SHIPPED) -> Lifter:
-    """The lifter that ships, by its name, or one from a file.
+    """Load the shipped lifter by its name, or a lifter from a file.
 
     Raises:
-        FileNotFoundError: it is not the name, and there is no such file.
-        ValueError: the file is no lifter, or one of another version.
+        FileNotFoundError: neither the shipped name nor an existing file.
+        ValueError: the file is not a lifter, or has another version.
     """
     path = FOLDER / f'{SHIPPED}.npz' if model == SHIPPED else Path(model)
     return _loaded(path, path.stat().st_mtime_ns)
 
 
-# Every track of several people takes one.
+# Cached, because each of several tracks loads one.
 @lru_cache(maxsize=4)
 def _loaded(path: Path, _changed_ns: int) -> Lifter:
     return Lifter.load(path)
 
 
 class KeypointHistory:
-    """The keypoints of one person in the last images, from which a lifter sees a window."""
+    """The keypoints of one person in the last images, as input to a lifter."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
@@ -461,10 +463,10 @@ class KeypointHistory:
         self._seen: list[tuple[float, Array, Array]] = []
 
     def add(self, keypoints: Keypoints, stamp: float) -> tuple[Array, Array]:
-        """Takes the keypoints of the next image; returns their `landmark_rays`.
+        """Add the keypoints of the next image and return their `landmark_rays`.
 
         Args:
-            stamp: of the image, s; later than those before.
+            stamp: time of the image, s; later than those before.
         """
         rays, confidences = landmark_rays(self._camera, keypoints)
         recent = [one for one in self._seen if one[0] >= stamp + EARLIEST]
@@ -472,7 +474,7 @@ class KeypointHistory:
         return rays, confidences
 
     def carry(self, rotation: Array) -> None:
-        """Takes the history into the frame (rotation (3, 3)) of a camera that has turned."""
+        """Rotate the history by `rotation` (3, 3) into the frame of a camera that has turned."""
         for i, (stamp, rays, confidences) in enumerate(self._seen):
             turned = product(np.concatenate([rays, np.ones((len(rays), 1))], axis=1), rotation.T)
             turned = turned[:, :2] / np.maximum(turned[:, 2:], BEFORE)
@@ -485,7 +487,7 @@ class KeypointHistory:
         person: Array | None = None,
         exchanges: Array | None = None,
     ) -> LiftedPoses | None:
-        """The mixture at the last image; None: nobody is seen.
+        """Predict the mixture at the last image; None if no person is seen.
 
         Args:
             up: (3,) unit vector against gravity, camera frame; None: unknown.
@@ -501,14 +503,14 @@ class KeypointHistory:
 
 
 def landmark_rays(camera: Camera, keypoints: Keypoints, scheme: str = AUTO) -> tuple[Array, Array]:
-    """Rays (L, 2), x / z and y / z, and confidences (L,) of the landmarks that keypoints show."""
+    """Return rays (L, 2), x / z and y / z, and confidences (L,) of the landmarks of keypoints."""
     rays, confidences = np.zeros((len(LANDMARKS), 2)), np.zeros(len(LANDMARKS))
     places = np.array(places_of(keypoints, scheme), dtype=np.intp)
     shown = np.flatnonzero(keypoints.seen & (places >= 0))
     if len(shown):
         found = camera.rays(keypoints.pixels[shown])
         rays[places[shown]] = found[:, :2] / np.maximum(found[:, 2:], BEFORE)
-        # A keypoint that may be anywhere says nothing, however confident it is.
+        # A keypoint with a large covariance carries no information, however confident it is.
         sigma = np.sqrt(0.5 * np.trace(keypoints.covariances[shown], axis1=1, axis2=2))
         known = ~(sigma > ANYWHERE * keypoints.magnification())
         confidences[places[shown]] = np.where(known, keypoints.confidences[shown], 0.0)
@@ -516,7 +518,7 @@ def landmark_rays(camera: Camera, keypoints: Keypoints, scheme: str = AUTO) -> t
 
 
 def lifted_positions(camera: Camera, keypoints: Keypoints) -> LiftedPoses | None:
-    """The pose that a detector which lifts estimates; None: it shows no hips."""
+    """Return the pose from a detector that estimates 3D positions; None if it lacks the hips."""
     assert keypoints.positions is not None
     seen = keypoints.seen
     if not seen.any():

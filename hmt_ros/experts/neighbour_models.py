@@ -1,4 +1,4 @@
-"""Models that keep the training set and look at the nearest neighbours of an input.
+"""Models that keep the training set and predict from the nearest neighbours of an input.
 
 `NearestNeighbours` is the weighted nearest neighbour baseline of BME 3:
 
@@ -10,10 +10,10 @@ over the K nearest training inputs. `LocalExperts` finds modes among the targets
 
 The neighbours have the weights w_n of a Gaussian kernel. Their targets are clustered, and each
 cluster is an expert. Its gate is the share of the kernel in the cluster; its mean is the kernel
-regression over the cluster. Where a few global experts are too stiff for a map with many folds,
-local ones follow it, at the price of keeping the training set.
+regression over the cluster. Local experts fit maps with many folds better than a few global
+experts, at the price of keeping the training set.
 
-In both, O is the covariance of the residuals of training targets, each predicted without itself.
+In both, O is the covariance of the leave-one-out residuals of training targets.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 
 BATCH = 256  # inputs whose neighbours are searched together
 RIDGE = 1e-6  # share of the targets' variance that is added to the covariance
-# Distances below this share of the spacing count as equal; else one neighbour has all the weight.
+# Minimum distance over the spacing; without it, one neighbour could have all the weight.
 CLOSEST = 1e-3
-# Least spacing of samples, which may all be the same, in scaled inputs.
+# Minimum spacing of samples, in scaled inputs; samples may coincide.
 LEAST_SPACING = 1e-9
-SWEEPS = 8  # of the clustering
+SWEEPS = 8  # maximum number of iterations of the clustering
 LEFT_OUT = 600  # training samples whose residuals give the covariance of local experts
 FAINT = 1e-12  # weight of an expert without neighbours
 MOST = 1000  # maximum number of neighbours, and of experts, in a file
@@ -65,7 +65,7 @@ class _NeighbourModel(ConditionalDensity):
     _stored: tuple[DTypeLike, DTypeLike] = (np.float64, np.float64)
 
     def _keep_pairs(self, pairs: TrainingPairs) -> Array:
-        """Keeps the samples; the ridge (D, D) of their covariance."""
+        """Store the samples and return the ridge (D, D) of their covariance."""
         self.n_inputs_, self.n_outputs_ = pairs.inputs.shape[1], pairs.targets.shape[1]
         self._keep(pairs, Standardisation.of(pairs.inputs, pairs.weights, self.scaling))
         offsets = pairs.targets - pairs.targets.mean(0)
@@ -87,9 +87,9 @@ class _NeighbourModel(ConditionalDensity):
         return self._nearest(self._standardisation.apply(self._checked(inputs)), count)
 
     def _nearest(self, points: Array, count: int) -> tuple[Array, Index]:
-        """The same for standardised inputs.
+        """Do the same for standardised inputs.
 
-        With as many dimensions as descriptors have, no tree is faster than a full search.
+        In the high dimension of descriptors, no tree is faster than a full search.
         """
         distances, rows = np.empty((len(points), count)), np.empty((len(points), count), np.intp)
         for i in range(0, len(points), BATCH):
@@ -207,14 +207,14 @@ class LocalExperts(_NeighbourModel):
     Args:
         n_experts: Maximum number of modes M of an input.
         n_neighbours: Number of neighbours K, less than the number of samples.
-        width_neighbour: The kernel is as wide as the distance of this neighbour.
+        width_neighbour: Rank of the neighbour whose distance is the kernel width.
 
     Attributes:
         spacing_: Root mean squared distance of a training input to its nearest one, scaled.
     """
 
     kind = 'local_experts'
-    # Half precision is far finer than the silhouettes of one pose differ.
+    # Half precision is far finer than the differences between silhouettes of one pose.
     _stored = (np.float16, np.float32)
 
     def __init__(
@@ -282,7 +282,7 @@ class LocalExperts(_NeighbourModel):
         return np.asarray(elementary.exp(-0.5 * (distances[:, 0] / (3.0 * self.spacing_)) ** 2))
 
     def _modes(self, distances: Array, index: Index) -> tuple[Array, Array, Array, Array]:
-        """Clusters of the neighbours (n, K) of n inputs.
+        """Cluster the neighbours (n, K) of n inputs.
 
         K-means with the weights of the kernel, for all inputs at once; scipy's has no weights.
 
@@ -301,7 +301,8 @@ class LocalExperts(_NeighbourModel):
         between = (
             squared[:, :, None] + squared[:, None] - product(2.0 * targets, targets.swapaxes(1, 2))
         )
-        # Seeds: the nearest neighbour, then each time the one that is heaviest and furthest away.
+        # Seeds: the nearest neighbour, then repeatedly the maximum of weight times squared
+        # distance.
         rows = np.arange(n)
         nearest = between[rows, 0]
         owner = np.zeros((n, count), dtype=np.intp)
@@ -325,7 +326,7 @@ class LocalExperts(_NeighbourModel):
         member = (owner[:, None] == experts) * kernel[:, None]
         total = member.sum(2)
         empty = total <= 0
-        # An expert without members has the mean of the heaviest one and no weight.
+        # An expert without members gets the mean of the heaviest expert and no weight.
         heaviest = total.argmax(1)
         member = np.where(empty[..., None], member[rows, heaviest][:, None], member)
         shares = member / member.sum(2, keepdims=True)

@@ -2,12 +2,12 @@
 
     p(x | r) = sum_i g_i(r) N(x; f_i(r), c_i(r) O_i)                       (BME 10 and 12)
 
-A kernel model keeps samples, and grows with them; the size of a network does not depend on them, so
-that it can learn from all motions, seen from everywhere. Here c_i may be below 1: an expert itself
-predicts how certain it is.
+A kernel model keeps samples and grows with them. The size of a network is constant, so it can learn
+from all motions in views from all directions. Here c_i may be below 1: an expert itself predicts
+how certain it is.
 
-It learns in `hmt_learning.training.network_learning`. `Layers` have units that leak; each layer is
-added to the last.
+`hmt_learning.training.network_learning` trains it. `Layers` have leaky units and residual
+connections.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 # Limits of log sqrt(c).
 WIDTHS = 2.0
 LEAK = 0.1  # slope of a unit below 0
-# Maximum number of layers in a file, and of its outputs for inputs of a size, whitened.
+# Maximum number of layers in a file, size of whitened inputs, and size of the outputs for these.
 MOST_LAYERS, LARGEST_INPUT, LARGEST_OUTPUT = 100, np.float32(100.0), 1e15
 
 Floats = NDArray[np.float32]
@@ -42,7 +42,7 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Layers:
-    """Layers of H units, after which come O numbers.
+    """Layers of H units, followed by O outputs.
 
     Attributes:
         first, first_bias: (p, H), (H,).
@@ -108,7 +108,7 @@ class NetworkExperts(ConditionalDensity):
 
     Args:
         units, layers: Width of the layers, and number of those that add to the first.
-        jitter: Standard deviation of the noise on inputs while learning, in theirs.
+        jitter: Standard deviation of the noise on inputs in training, over that of the inputs.
 
     Attributes:
         noise_: (M, D, D) O.
@@ -147,7 +147,7 @@ class NetworkExperts(ConditionalDensity):
         centres: Array,
         spacing: float,
     ) -> None:
-        """Takes the results of learning.
+        """Set the results of training.
 
         Args:
             layers: with the outputs gates (M), log widths (M) and means (M D).

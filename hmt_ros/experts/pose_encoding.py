@@ -1,12 +1,11 @@
-"""The encoding of poses as targets for experts: as the camera sees them, without wrap-around.
+"""The encoding of poses as targets for experts: relative to the view, without wrap-around.
 
 A target has D = 6 + A numbers. The first six are the front axis and the up axis of the pelvis, in
 the frame of the viewing ray: the camera at the level of the body, turned so that its optical axis
-meets the pelvis. One
-posture then has one target wherever it is in the image, and a turning person does not jump from
-+180 to -180 degrees. The other numbers are the A joint angles, whose limits span less than a turn.
-The position of the person is not part of the target, because the shape of a silhouette does not
-show it; see `root_placement`.
+meets the pelvis. A posture then has the same target everywhere in the image, and a turning person
+does not jump from +180 to -180 degrees. The other numbers are the A joint angles, whose limits span
+less than a turn. The position of the person is not part of the target, because the shape of a
+silhouette does not show it; see `root_placement`.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ from hmt_ros.inference.linear_algebra import product, pseudo_inverse
 AXES = 6
 ROOT = ('root_tx', 'root_ty', 'root_tz')
 TURNS = ('root_z', 'root_y', 'root_x')
-# A mean over opposite headings is a short vector, whose direction means little: its derivative is
-# computed as if it had at least this length.
+# Minimum length of an axis in its derivatives: a mean over opposite headings is a short vector,
+# whose direction carries little information.
 SHORTEST = 0.1
-# Coordinates after each one, and before it.
+# Next and previous coordinate of each one, cyclically.
 NEXT, LAST = [1, 2, 0], [2, 0, 1]
 STEEPEST = np.radians(86.0)  # limit of the middle root angle, near which the other two coincide
 
@@ -39,8 +38,8 @@ class PoseEncoding:
     """Targets of the poses of a body.
 
     Attributes:
-        body: Body whose root has the degrees of freedom tx, ty, tz, z, y, x in this order, as the
-            bodies that ship have.
+        body: Body whose root has the degrees of freedom tx, ty, tz, z, y, x in this order, as in
+            the shipped bodies.
 
     Raises:
         ValueError: the body has another root.
@@ -92,7 +91,7 @@ class PoseEncoding:
     def jacobians(self, targets: ArrayLike, roots: ArrayLike) -> tuple[Array, Array]:
         """Derivatives of `decode` with respect to targets (N, d, D) and roots (N, d, 3).
 
-        Clipping of joint angles is ignored, so that their variance stays.
+        Clipping of joint angles is ignored, so that their variance is kept.
         """
         targets, roots = self._checked(targets, roots)
         n, d = len(targets), self.body.dimension
@@ -228,7 +227,7 @@ def _rotation_by_axes(axes: Array) -> Array:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Cross products (..., 3), as numpy's, in a fourth of the time for a few of them."""
+    """Cross products (..., 3); four times as fast as numpy's for a few of them."""
     return np.asarray(a[..., NEXT] * b[..., LAST] - a[..., LAST] * b[..., NEXT])
 
 

@@ -3,8 +3,8 @@
     mask, image -> centred view -> descriptor -> experts -> mixture over targets
     mask -> bounding box -> root of each component -> mixture over poses
 
-One object and one file hold everything that is learned. The mixture of the image before can be
-propagated by rule (1) (BME 2.1), with a model of p(x_t | x_t-1, r_t) that has learned for one step.
+One object and one file hold everything that is learned. Rule (1) (BME 2.1) can propagate the
+mixture of the image before, with a model of p(x_t | x_t-1, r_t) trained for one time step.
 """
 
 from __future__ import annotations
@@ -60,22 +60,22 @@ from hmt_ros.inference.linear_algebra import inverse, product, singular_values
 from hmt_ros.inference.reduction import reduced
 
 FOLDER = Path(__file__).resolve().parent / 'models'
-# Learned from motion capture: its notes are its card.
+# Name of the shipped model, learned from motion capture; its notes are its card.
 SHIPPED = 'silhouettes'
 
 KIND = 'pose_predictor'
 MAX_COMPONENTS = 8
 LIGHTEST = 1e-3  # weight below which a component is dropped
-# Rate of the sequences that rule (1) learns from, Hz, and their time step, s.
+# Rate of the training sequences of rule (1), Hz, and their time step, s.
 RATE = 30.0
 STEP = 1.0 / RATE
 JITTER = 1e-9  # variance that is added to poses, m^2 and rad^2
-# How a mixture is propagated: by rule (1), or not at all.
+# Ways to propagate a mixture: by rule (1), or not at all.
 BY_EXPERTS, ALONE = 'experts', 'none'
 PROPAGATIONS = (BY_EXPERTS, ALONE)
-# Rate at which a past turns out to be wrong, per second: a track that is lost recovers. Chosen.
+# Rate at which the past is taken for wrong, 1/s, so that a lost track recovers. Chosen by hand.
 FORGETTING = 5.0
-# Largest condition of a basis of targets; how much an offset may differ from the usual one, m.
+# Maximum condition number of a target basis; maximum deviation of an offset from the usual one, m.
 WORST_CONDITION, OFFSET = 1e12, 0.06
 
 
@@ -98,14 +98,14 @@ class PosePredictor:
     """Predicts mixtures over the poses of a body from silhouettes.
 
     Args:
-        model: Model of p(z | descriptor) that has learned.
+        model: Trained model of p(z | descriptor).
         target_basis: (D, D) B; models learn z = B' x of a target x.
-        equilibrium: p(x) of targets: a mixture of one component.
-        dynamics: Model of p(z | previous z, descriptor) that has learned, or None.
-        notes: Card of its file; JSON must be able to hold it.
+        equilibrium: p(x) of targets, a mixture of one component.
+        dynamics: Trained model of p(z | previous z, descriptor), or None.
+        notes: Card of the file, serialisable as JSON.
 
     Raises:
-        ValueError: the parts do not fit each other.
+        ValueError: the parts do not match.
     """
 
     def __init__(
@@ -145,7 +145,7 @@ class PosePredictor:
         return self.encoding.body
 
     def with_body(self, body: Body) -> PosePredictor:
-        """The predictor for a person with other segment lengths, or another level.
+        """Return the predictor for a body with other segment lengths, or another level.
 
         Raises:
             ValueError: the body has other degrees of freedom.
@@ -179,21 +179,21 @@ class PosePredictor:
         size_spread: float = SIZE_SPREAD,
         image: Image | None = None,
     ) -> Prediction:
-        """The prediction from the silhouette of a person.
+        """Predict poses from the silhouette of a person.
 
         Args:
-            mask: (H, W), not zero in the foreground.
-            previous: Mixture over poses before, which is propagated; None: the image counts alone.
-            interval: s, since then.
+            mask: (H, W) nonzero in the foreground.
+            previous: Previous mixture over poses, to be propagated; None to use the image alone.
+            interval: Time since `previous`, s.
             propagation: one of `PROPAGATIONS`.
             max_components: Maximum number of components of the mixture; the heaviest stay.
             size_spread: Relative standard deviation of the person's size; 0 if the body has the
                 lengths of the person.
-            image: (H, W, 3) BGR, in which edges inside the mask are looked for; None: unknown.
+            image: (H, W, 3) BGR image, for edges inside the mask; None: unknown.
 
         Raises:
             NoSilhouetteError: the mask has no person.
-            ValueError: mask or image have not the size of the camera's image.
+            ValueError: the mask or the image differs in size from the camera's image.
         """
         seen = np.asarray(mask)
         require(
@@ -225,7 +225,7 @@ class PosePredictor:
         return Prediction(mixture, blob, support)
 
     def described(self, blob: PersonBlob, camera: Camera, image: Image | None = None) -> Array:
-        """Descriptor (p,) of a person."""
+        """Compute the descriptor (p,) of a person."""
         grey = None
         if image is not None:
             grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
@@ -242,13 +242,13 @@ class PosePredictor:
         propagation: str = ALONE,
         max_components: int = MAX_COMPONENTS,
     ) -> GaussianMixture:
-        """Mixture over targets (D,) for one descriptor, heaviest component first.
+        """Predict the mixture over targets (D,) for one descriptor, heaviest component first.
 
         Args:
             descriptor: (p,).
 
         Raises:
-            ValueError: the propagation is another one, or its model is missing.
+            ValueError: the propagation is unknown, or its model is missing.
         """
         row = np.asarray(descriptor, dtype=np.float64)
         found = _heaviest(self.model.predict(row[None])[0], max_components)
@@ -261,8 +261,8 @@ class PosePredictor:
             raise ValueError('the predictor has no model for rule (1): train it with --dynamics')
         # Beyond the step that the model has learned, poses follow the motion prior of the body.
         before = self._to_targets(self._expected(previous, max(interval - STEP, 0.0)))
-        # Where experts are steep, uncertainty would grow from step to step without end: it is kept
-        # below that of p(x).
+        # Where experts are steep, the covariance would grow without bound from step to step; it is
+        # kept below that of p(x).
         known = inverse(before.covariances) + inverse(self.equilibrium.covariances)
         before = GaussianMixture(before.weights, before.means, inverse(known))
         after = propagate(
@@ -277,13 +277,13 @@ class PosePredictor:
         return _transformed(whole, self._from_basis)
 
     def poses_at(self, descriptor: Array, root: Array, max_components: int) -> tuple[Array, Array]:
-        """Poses (K, d) with a known root (3,) for one descriptor, heaviest first; weights (K,)."""
+        """Predict poses (K, d) with a known root (3,), heaviest first, and their weights (K,)."""
         targets = self.targets_after(descriptor, max_components=max_components)
         roots = np.repeat(root[None], len(targets), axis=0)
         return self.encoding.decode(targets.means, roots), targets.weights
 
     def _expected(self, poses: GaussianMixture, interval: float) -> GaussianMixture:
-        """The mixture over poses after an interval, s, by the motion prior of the body."""
+        """Predict the mixture over poses after an interval, s, by the motion prior of the body."""
         if interval <= 0.0:
             return poses
         prior = motion_prior(self.body)
@@ -292,10 +292,10 @@ class PosePredictor:
         )
 
     def _to_targets(self, poses: GaussianMixture) -> GaussianMixture:
-        """The mixture over targets of a mixture over poses."""
+        """Convert a mixture over poses to one over targets."""
         slopes = self.encoding.encoding_jacobians(poses.means)
         covariances = product(product(slopes, poses.covariances), slopes.transpose(0, 2, 1))
-        # Axes of unit length have no spread along themselves.
+        # Unit vectors have no variance along themselves, so the covariance would be singular.
         covariances += JITTER * np.eye(self.encoding.size)
         return GaussianMixture(poses.weights, self.encoding.encode(poses.means), covariances)
 
@@ -320,7 +320,7 @@ class PosePredictor:
 
     @classmethod
     def from_arrays(cls, arrays: Arrays, body: Body | None = None) -> PosePredictor:
-        """The predictor that `to_arrays` and a card describe; see `load`.
+        """Build the predictor that `to_arrays` and a card describe; see `load`.
 
         Raises:
             ValueError, LookupError, TypeError: arrays or parameters are missing or wrong, or the
@@ -330,7 +330,7 @@ class PosePredictor:
         if body is None:
             body, own = body_of(parameters), parameters['lengths']
             usual = body.segment_lengths
-            # Some are offsets near zero, of either sign.
+            # Some lengths are offsets near zero, of either sign.
             allowed = {k: 0.9 * x if x > OFFSET else OFFSET for k, x in usual.items()}
             human = all(abs(own[k] - x) <= allowed[k] for k, x in usual.items())
             require(human and own.keys() == usual.keys(), 'nobody has its lengths')
@@ -355,7 +355,7 @@ class PosePredictor:
         )
 
     def answer(self, given: Array) -> GaussianMixture:
-        """The mixture over targets (D,) for the parts of a silhouette; with dynamics, by these."""
+        """Return the mixture over targets (D,) for the parts of a silhouette, by any dynamics."""
         contexts, *others = np.split(given, np.cumsum([-FIXED, PAIR_BINS, MAP * MAP, MOMENTS]))
         parts = SilhouetteParts(contexts.reshape(-1, RADIAL * ANGULAR), *others)
         row = self.descriptor.describe([parts])[0]
@@ -365,34 +365,34 @@ class PosePredictor:
         return _transformed(found, self._from_basis)
 
     def save(self, path: str | Path) -> Path:
-        """Writes the predictor into an .npz file, with its notes as the card; returns its path."""
+        """Write the predictor to an .npz file, with its notes as the card, and return its path."""
         read = partial(self.from_arrays, body=self.body)
-        # Most numbers of the parts of a silhouette lie between 0 and 1.
+        # Most values of the parts of a silhouette lie between 0 and 1.
         size = self.descriptor.points * RADIAL * ANGULAR + FIXED
         example = np.random.default_rng(0).integers(0, 64, size) / 64.0
         return write_model(path, self, read, self.notes, example)
 
     @classmethod
     def load(cls, path: str | Path, body: Body | None = None) -> PosePredictor:
-        """Reads a predictor that `save` wrote.
+        """Read a predictor that `save` wrote.
 
         Args:
-            body: Body of the person, with the degrees of freedom that the predictor has learned.
-                None takes the shipped body of that name, with the lengths in the file.
+            body: Body of the person, with the degrees of freedom of the predictor. None selects the
+                shipped body named in the file, with the lengths in the file.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: the file is no predictor, or one of another version or body, or a wrong one.
+            FileNotFoundError: the file does not exist.
+            ValueError: the file is not a predictor, has another version or body, or is invalid.
         """
         return read_model(path, KIND, partial(cls.from_arrays, body=body))
 
 
 def load_predictor(model: str | Path = SHIPPED) -> PosePredictor:
-    """A predictor that ships, by its name, or one from a file that `train` wrote.
+    """Load a shipped predictor by its name, or a predictor from a file that `train` wrote.
 
     Raises:
-        FileNotFoundError: there is neither such a name nor such a file.
-        ValueError: the file is no predictor, or one of another version or body.
+        FileNotFoundError: neither a shipped name nor an existing file.
+        ValueError: the file is not a predictor, or has another version or body.
     """
     known = sorted(path.stem for path in FOLDER.glob('*.npz'))
     if str(model) in known:
@@ -419,14 +419,14 @@ def _check_fit(what: str, model: ConditionalDensity, inputs: int, outputs: int) 
 
 
 def _heaviest(mixture: GaussianMixture, count: int) -> GaussianMixture:
-    """The heaviest components, normalised."""
+    """Return the heaviest components, normalised."""
     ordered = mixture.normalised().sorted()
     kept = max(int((ordered.weights >= LIGHTEST).sum()), 1)
     return ordered[: min(kept, count)].normalised()
 
 
 def _transformed(mixture: GaussianMixture, basis: Array) -> GaussianMixture:
-    """The mixture over B' x of a mixture over x."""
+    """Convert a mixture over x to one over B' x."""
     covariances = product(product(basis.T, mixture.covariances), basis)
     covariances = 0.5 * (covariances + covariances.transpose(0, 2, 1))
     return GaussianMixture(mixture.weights, product(mixture.means, basis), covariances)

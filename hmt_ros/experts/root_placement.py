@@ -7,11 +7,11 @@ silhouette, and J = dr/dt, the Gauss-Newton step is
 
     t <- t - (J' S^-1 J + P^-1)^-1 (J' S^-1 r + P^-1 (t - t_0)),   S = J_x C J_x' + noise
 
-C is the covariance of the predicted posture, which has the derivative J_x: an arm that may also
-hang down says little about the width. P is a wide prior. A side at which the border of the image
-cuts the person only says that the person reaches that border. The root then depends on the other
-sides and on P, and its covariance is larger. A person may be larger or smaller than the body, which
-scales all distances from the camera alike.
+C is the covariance of the predicted posture, and J_x the derivative with respect to it: an arm that
+may also hang down carries little information about the width. P is a wide prior. A side where the
+border of the image cuts the person only shows that the person reaches this border. The root then
+depends on the other sides and on P, and its covariance is larger. A person may be larger or smaller
+than the body, which scales all distances from the camera alike.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from hmt_ros.experts.pose_encoding import PoseEncoding, cross
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import inverse, product, solve
 
-STACKS, SLICES = 9, 12  # of the mesh; its box is exact to 1 % of the radius of a part
+STACKS, SLICES = 9, 12  # size of the mesh; its box is exact to 1 % of the radius of a part
 SIZE_SPREAD = 0.06  # relative standard deviation of the size of persons
-CUT_SPREAD = 0.15  # additional one for a person whom the border cuts
+CUT_SPREAD = 0.15  # additional deviation for a person who is cut by the border
 # Standard deviation of a side of the box: of the outline, px, and of hair, clothes and shoes, as a
 # share of the longer side of the box.
 OUTLINE_SIGMA, CLOTHES = 1.5, 0.02
 # Prior standard deviations along and across the line of sight, as shares of the distance.
 DEPTH_SPREAD, ACROSS_SPREAD = 0.7, 1.0
 STEPS = 10
-# Steps as shares of the depth: the end of the iterations, the length from which the derivatives of
-# the encoding are computed again, and the maximum length.
+# Step lengths over the depth: below which the iterations end, above which the derivatives of the
+# encoding are recomputed, and the maximum.
 DONE, TURNED, LONGEST_STEP = 1e-3, 0.05, 0.4
 
 
@@ -72,11 +72,11 @@ def place_roots(
     *,
     size_spread: float = SIZE_SPREAD,
 ) -> RootPlacement:
-    """Roots of the postures that were predicted from a silhouette.
+    """Place the roots of postures predicted from a silhouette.
 
     Args:
-        targets: (M, D) predicted.
-        covariances: (M, D, D) of the prediction.
+        targets: (M, D) predicted targets.
+        covariances: (M, D, D) covariances of the prediction.
         size_spread: Relative standard deviation of the person's size; 0 if the body has the lengths
             of the person.
 
@@ -132,7 +132,7 @@ def place_roots(
 def placed_gaussians(
     encoding: PoseEncoding, targets: Array, covariances: Array, placement: RootPlacement
 ) -> tuple[Array, Array]:
-    """Gaussians over poses, (M, d) and (M, d, d), from Gaussians over targets and their placement.
+    """Convert Gaussians over targets and roots to Gaussians over poses, (M, d) and (M, d, d).
 
     The root moves with the posture so that the box stays that of the silhouette.
 

@@ -24,19 +24,19 @@ import numpy as np
 
 from hmt_ros.inference.arrays import Array, Index
 
-# A candidate is not added if the active functions explain all but this share of it.
+# Unexplained share of a candidate, given the active functions, below which it is not added.
 INDEPENDENT = 1e-8
-# Two functions that differ by less than this share of their squares count as one.
+# Relative squared difference below which two functions count as equal.
 ALIGNED = 1e-8
-# Largest standard deviation of a weight, in standard deviations of the outputs. Kernels of which an
-# expert's samples see the tails alone would get weights without bounds.
+# Largest standard deviation of a weight, in standard deviations of the outputs. Without it, kernels
+# of which the expert's samples reach only the tails would get unbounded weights.
 LARGEST_WEIGHT = 10.0
-ROUNDS = 100  # of greedy steps, each followed by a new estimate of the noise
+ROUNDS = 100  # maximum number of rounds of greedy steps and a new noise estimate
 
 
 @dataclass(frozen=True, eq=False)
 class WeightedSums:
-    """Sums over samples, from which the evidence follows.
+    """Sums over samples that determine the evidence.
 
     Attributes:
         gram: (K, K) Phi' H Phi of all candidates.
@@ -53,7 +53,7 @@ class WeightedSums:
     @classmethod
     def of(cls, features: Array, targets: Array, weights: Array) -> WeightedSums:
         """Sums over features (N, K), targets (N, D), weights (N,)."""
-        # Most samples belong to other experts.
+        # Samples of other experts have no weight.
         some = weights > 1e-10 * weights.max()
         if not some.all():
             features, targets, weights = features[some], targets[some], weights[some]
@@ -68,7 +68,7 @@ class RegressionPrior:
 
     Attributes:
         strength: Strength nu >= 0, in samples.
-        scale: (D, D) nu times the covariance that the prior pulls to.
+        scale: (D, D) nu times the covariance preferred by the prior.
     """
 
     strength: float
@@ -226,7 +226,7 @@ class _GreedyState:
         self._exclude()
 
     def step(self, tolerance: float) -> bool:
-        """Makes the best change; False when no change gains more than the tolerance, nats."""
+        """Make the best change; return False if no change gains more than the tolerance, nats."""
         with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
             k, gain, precision = self._best()
         if not gain > tolerance:
@@ -267,7 +267,7 @@ class _GreedyState:
         return k, float(gain[k]), float(best[k])
 
     def _exclude(self) -> None:
-        """Excludes candidates that equal an active function, which would add nothing."""
+        """Exclude candidates that equal an active function, because they would add nothing."""
         squares = np.diagonal(self.gram)
         aligned = self.gram[:, self.active] ** 2 >= (1.0 - ALIGNED) * np.outer(
             squares, squares[self.active]

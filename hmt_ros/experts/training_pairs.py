@@ -1,4 +1,4 @@
-"""Pairs of inputs and targets, checked once where they enter, and their scales."""
+"""Pairs of inputs and targets, checked once on entry, and their scales."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Standardisation:
                 which keeps the metric. A column that does not vary keeps its scale.
 
         Raises:
-            ValueError: the scaling is another one.
+            ValueError: the scaling is unknown.
         """
         require(scaling in SCALINGS, f'scaling is {scaling!r}, wanted one of {", ".join(SCALINGS)}')
         share = weights / weights.sum()
@@ -132,7 +132,7 @@ def finite_matrix(values: ArrayLike, name: str, wanted: str) -> Array:
     """Values as a matrix of finite numbers.
 
     Raises:
-        ValueError: the values have not two axes, or are not finite.
+        ValueError: the values do not have two axes, or are not finite.
     """
     matrix = np.asarray(values, dtype=np.float64)
     require(matrix.ndim == 2, f'{name} have shape {matrix.shape}, wanted {wanted}')

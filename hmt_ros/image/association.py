@@ -4,12 +4,12 @@
 
 u_i are the joints of person i where they were last seen, v_i is the velocity of the person in the
 image, s_i the size of the person, and p_j are the joints of detection j; where they have no joints
-in common the middles of their boxes count. A pair is possible below a cost that grows with the time
-for which the person was not seen. The assignment minimises the sum of costs; a person without a
-detection has the cost of the worst possible pair.
+in common, the middles of their boxes count. A pair is possible below a cost that grows with the
+time for which the person was not seen. The assignment minimises the sum of costs; a person without
+a detection has the cost of the worst possible pair.
 
 The nearer of two people hides the farther one. For the farther one all pixels of the nearer one are
-unknown; for the nearer one only those that the farther one covers beside it.
+unknown; for the nearer one only those of the farther one outside its own area.
 """
 
 from __future__ import annotations
@@ -29,13 +29,12 @@ from hmt_ros.inference.error_model import seconds
 # Cost below which a pair is possible from one image to the next, in sizes of the person; it doubles
 # within `EXPECTED_TIME`.
 GATE = 0.4
-# Time for which a person is taken to go on as before, and to keep the size though less is seen now,
-# s.
+# Time for which a person is assumed to keep the velocity, and the size although less is visible, s.
 EXPECTED_TIME = 1.0
 # Time constant of the velocity of a person in the images, s.
 VELOCITY_TIME = 0.25
-# Margin around the area of a person, or around the hull of keypoints, that is masked for others, as
-# a fraction of the height: the radius of a limb.
+# Margin around the area of a person, or around the hull of keypoints, that is masked for other
+# people, as a fraction of the height: the radius of a limb.
 LIMB_MARGIN = 0.05
 
 
@@ -53,22 +52,22 @@ class Sighting:
 
     @classmethod
     def of(cls, keypoints: Keypoints, corners: Array) -> Sighting:
-        """A sighting from keypoints, maybe none, and a box."""
+        """A sighting from a box and keypoints, which may be empty."""
         seen = np.flatnonzero(keypoints.seen)
         return cls({keypoints.names[i]: keypoints.pixels[i] for i in seen}, corners)
 
     @property
     def middle(self) -> Array:
-        """(2,) of the box, px."""
+        """Middle (2,) of the box, px."""
         return np.asarray(self.corners.mean(0))
 
     @property
     def size(self) -> float:
-        """Diagonal of the box, px; 1 at least."""
+        """Diagonal of the box, px; at least 1."""
         return max(float(elementary.hypot(*(self.corners[1] - self.corners[0]))), 1.0)
 
     def shifts_to(self, other: Sighting) -> Array:
-        """Shifts (n, 2) of the common joints to another sighting; without any, of the middle."""
+        """Shifts (n, 2) of the common joints, or else of the middle, to another sighting."""
         common = [name for name in self.joints if name in other.joints]
         if not common:
             return np.asarray((other.middle - self.middle)[None])
@@ -79,8 +78,8 @@ class ImageTrack:
     """Where a person was last seen in the images, and how fast the person moves there.
 
     Args:
-        sighting: the first.
-        stamp: of its image, ns.
+        sighting: the first one.
+        stamp: stamp of its image, ns.
 
     Attributes:
         sighting: the last one.
@@ -96,18 +95,18 @@ class ImageTrack:
         self._known_for = 0.0
 
     def update(self, sighting: Sighting, stamp: int) -> None:
-        """Takes the next sighting, of a later image."""
+        """Replaces the last sighting by one in a later image."""
         dt = seconds(stamp - self.stamp)
         moved = np.median(self.sighting.shifts_to(sighting), axis=0)
         self._known_for += dt
-        # At first the mean over all sightings, later that over the last moments.
+        # The mean over all sightings at first, and over the last moments later.
         gain = min(dt / min(self._known_for, VELOCITY_TIME), 1.0)
         self.velocity += gain * (moved / dt - self.velocity)
         self.size = max(sighting.size, self.size * float(elementary.exp(-dt / EXPECTED_TIME)))
         self.sighting, self.stamp = sighting, stamp
 
     def shift(self, stamp: int) -> Array:
-        """Way (2,) that the person is expected to have moved since then, px."""
+        """Expected displacement (2,) of the person since the last sighting, px."""
         dt = min(seconds(stamp - self.stamp), EXPECTED_TIME)
         return np.asarray(dt * self.velocity)
 
@@ -117,14 +116,14 @@ class ImageTrack:
         return float(np.median(elementary.hypot(*off.T))) / self.size
 
     def gate(self, stamp: int) -> float:
-        """Cost from which a sighting is of somebody else."""
+        """Cost from which a sighting shows somebody else."""
         return GATE * (1.0 + min(seconds(stamp - self.stamp) / EXPECTED_TIME, 1.0))
 
 
 def assigned(
     tracks: Sequence[ImageTrack], sightings: Sequence[Sighting], stamp: int
 ) -> dict[int, int]:
-    """Number of the sighting in an image by number of the track, for tracks that have one."""
+    """Index of the sighting by index of the track, for tracks that have one."""
     if not tracks or not sightings:
         return {}
     costs = np.array([[track.cost(each, stamp) for each in sightings] for track in tracks])
@@ -139,11 +138,11 @@ def assigned(
 
 
 def unknown_area(mine: Mask, nearer: Sequence[Mask], farther: Sequence[Mask]) -> Mask | None:
-    """Pixels (H, W) without evidence about a person; None: there are none.
+    """Pixels (H, W) without evidence about a person; None if there are none.
 
     Args:
         mine: (H, W) that the person covers.
-        nearer, farther: areas of the people before and behind the person.
+        nearer, farther: areas of the people in front of and behind the person.
     """
     result = np.zeros_like(mine)
     for area in nearer:
@@ -154,7 +153,7 @@ def unknown_area(mine: Mask, nearer: Sequence[Mask], farther: Sequence[Mask]) ->
 
 
 def hull(sighting: Sighting, shape: tuple[int, ...]) -> Mask:
-    """Pixels (H, W) within the joints of somebody, or within the box, with a margin."""
+    """Pixels (H, W) in the hull of somebody's joints, or in the box, with a margin."""
     joints = np.array(list(sighting.joints.values()))
     if len(joints) < 3:
         (left, top), (right, bottom) = sighting.corners.tolist()

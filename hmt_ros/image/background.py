@@ -1,18 +1,18 @@
 """The person's silhouette by background subtraction, shadows removed.
 
 The background is either a given image of the empty scene or learned from frames in which the person
-is absent or moves. A model of the table `BACKGROUNDS` does the per-pixel work, on images made
-smaller to about `LINES` lines: the cost does not depend on the camera, and the outline that comes
-back is smooth to a fraction of their pixels. A background that turns out
-to be useless is rebuilt from the pixels of images where the person is not.
+is absent or moves. A model of the table `BACKGROUNDS` does the per-pixel work, on images reduced
+to about `LINES` lines: the cost does not depend on the camera, and the outline is interpolated to a
+fraction of their pixels. A useless background is rebuilt from the pixels of images where the person
+is not.
 
-`SceneWatch` tells whether the camera still sees the scene from where the background was taken:
+`SceneWatch` checks whether the camera still sees the scene from where the background was taken:
 
     r(s) = normalised cross-correlation of |grad background| with |grad image|, shifted by s
 
 on images that are `WIDTH` px wide, for shifts of up to `REACH`. The maximum is at s = 0 as long as
-the camera has not moved, whoever walks in front of it, and whatever the light does: edges stay
-where they are. It is elsewhere after a bump; after a larger one nothing fits.
+the camera has not moved, even if people walk in front of it or the light changes: edges stay where
+they are. After a bump the maximum is elsewhere; after a larger one no shift fits.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ BACKGROUNDS: dict[str, Callable[[float, float], Background]] = {
     'knn': neighbour_background,
 }
 
-# Number of lines that images are made smaller to, about: by a whole factor.
+# Approximate number of lines of reduced images; they are reduced by an integer factor.
 LINES = 240
 
-# Grey levels by which a pixel may differ from the colours of the background around it: compression
-# and aliasing move its edges.
+# Tolerance of a pixel against the background colours around it, grey levels: compression and
+# aliasing move edges.
 BESIDE = 8
-# A pixel is known again when so many images without the person before it agree within so many grey
-# levels.
+# Number of images without the person that must agree before a pixel is known again, and tolerance
+# of this agreement, grey levels.
 AGREEING = 10
 AGREEMENT = 20.0
-# Pixels around those of a mask that what is done with it may reach.
+# Margin around a mask that morphological operations on it may reach, px.
 AROUND = 2
 
 
@@ -94,9 +94,9 @@ class Silhouette(NamedTuple):
     """Pixels that differ from the background.
 
     Attributes:
-        foreground: (H, W) the person.
-        unsure: (H, W) darker than the background in the same colour: a shadow, or clothes in the
-            colours of the scene; None: there is nothing unsure.
+        foreground: (H, W) pixels of the person.
+        unsure: (H, W) pixels darker than the background in the same colour: a shadow, or clothes
+            in the colours of the scene; None if there are none.
     """
 
     foreground: Mask
@@ -107,10 +107,10 @@ class BackgroundModel:
     """Learns an empty scene and finds pixels that differ from it.
 
     Attributes:
-        settings: of the subtraction.
+        settings: parameters of the subtraction.
         frames: number of images that were learned.
-        changed: share of the pixels of the last image that differ from the background, shadows
-            among them.
+        changed: fraction of the pixels of the last image that differ from the background, including
+            shadows.
     """
 
     def __init__(self, settings: BackgroundSettings | None = None) -> None:
@@ -120,7 +120,7 @@ class BackgroundModel:
         self.changed = 0.0
         self._shape: tuple[int, ...] = ()
         self._nearby: tuple[Image, Image] | None = None
-        # The last image and its result: several people ask for the same.
+        # The last image and its labels: several people share one background.
         self._last: tuple[Image, Image] | None = None
         self._parts: _Parts | None = None
 
@@ -134,10 +134,10 @@ class BackgroundModel:
         return model
 
     def learn(self, image: Image) -> None:
-        """Takes one more frame (H, W, 3) of the scene into the model.
+        """Adds a frame (H, W, 3) of the scene to the model.
 
         Raises:
-            ValueError: the image is not like those before.
+            ValueError: the image has another shape than those before.
         """
         if self.frames == 0:
             self._shape = image.shape
@@ -147,7 +147,7 @@ class BackgroundModel:
         self._nearby = self._last = None
 
     def forget(self) -> None:
-        """Forgets all that was learned; `complete` puts the background together anew."""
+        """Forgets all that was learned; `complete` rebuilds the background."""
         shape = self._shape
         if self.frames == 0:
             return
@@ -155,10 +155,10 @@ class BackgroundModel:
         self._learn_alone(np.zeros(shape, dtype=np.uint8))
 
     def complete(self, image: Image, person: Mask) -> None:
-        """Takes the pixels of an image where the person (H, W) is not, if they are unknown.
+        """Learns the unknown pixels from an image where the person (H, W) is not.
 
         Raises:
-            ValueError: the image is not like those before.
+            ValueError: the image has another shape than those before.
         """
         self._check(image)
         if self._parts is None:
@@ -170,18 +170,18 @@ class BackgroundModel:
 
     @property
     def unknown(self) -> Mask | None:
-        """Pixels (H, W) that have not been seen without the person since `forget`; None: none."""
+        """Pixels (H, W) not yet seen without the person since `forget`; None if there are none."""
         return None if self._parts is None else self._parts.unknown
 
     @property
     def empty(self) -> Image:
-        """The empty scene (h, w, 3), as far as it is known, made smaller as all images are."""
+        """The empty scene (h, w, 3), as far as it is known, reduced as all images are."""
         return self._model.empty
 
     def foreground(self, image: Image) -> Mask:
         """Pixels (H, W) that differ from the background and are no shadow.
 
-        None where the background is unknown. The model does not change.
+        False where the background is unknown. The model does not change.
 
         Raises:
             ValueError: no background was learned, or the image has another size.
@@ -195,8 +195,8 @@ class BackgroundModel:
 
         Args:
             image: (H, W, 3) uint8.
-            region: x and y of the first and of the last pixel but one, where the person can be;
-                others may walk elsewhere.
+            region: (left, top, right, bottom) where the person can be, px, right and bottom
+                exclusive; other people may be outside.
 
         Raises:
             ValueError: no background was learned, or the image has another size.
@@ -206,10 +206,10 @@ class BackgroundModel:
     def split(
         self, image: Image, region: Box | None = None, others: Mask | None = None
     ) -> Silhouette:
-        """Foreground of an image, as for `silhouette`, and pixels of the person or of a shadow.
+        """Foreground of an image, as for `silhouette`, and unsure pixels.
 
         Args:
-            others: (H, W) pixels that somebody else covers; None: none.
+            others: (H, W) pixels that somebody else covers; None if there are none.
         """
         raw = self._subtracted(image)
         if others is not None:
@@ -228,7 +228,7 @@ class BackgroundModel:
         return Silhouette(found, unsure > found)
 
     def _subtracted(self, image: Image) -> Image:
-        """`FOREGROUND`, `SHADOW` or 0 (h, w), of an image made smaller."""
+        """Label `FOREGROUND`, `SHADOW` or 0 of each pixel (h, w) of the reduced image."""
         if self.frames == 0:
             raise ValueError('no background has been learned: give an image or some frames first')
         self._check(image)
@@ -249,7 +249,7 @@ class BackgroundModel:
         return raw
 
     def _beside(self, image: Image) -> Image:
-        """255 (h, w) where the background has the colour beside: its edges, slightly moved."""
+        """255 (h, w) where the background has the colour in a neighbouring pixel, else 0."""
         if self._nearby is None:
             empty = self.empty
             square = np.ones((3, 3), np.uint8)
@@ -264,22 +264,22 @@ class BackgroundModel:
 
     @property
     def _factor(self) -> int:
-        """How many times smaller images are made."""
+        """Integer factor by which images are reduced."""
         return max(round(self._shape[0] / LINES), 1)
 
     def _smaller(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """An image (H, W) or (H, W, 3) made smaller; a pixel is the mean of those it stands for."""
+        """An image (H, W) or (H, W, 3), reduced; a pixel is the mean of those that it replaces."""
         if self._factor == 1:
             return image
         size = tuple(-(-x // self._factor) for x in image.shape[1::-1])
         return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
     def _any_of(self, mask: Mask) -> Mask:
-        """Pixels (h, w) of an image made smaller of which a mask (H, W) has some part."""
+        """Pixels (h, w) of the reduced image that a mask (H, W) covers at least in part."""
         return self._smaller(255 * mask.view(np.uint8)) > 0
 
     def _larger(self, mask: Mask) -> Mask:
-        """A mask (h, w) in the size of images (H, W), its outline between the pixels smooth."""
+        """A mask (h, w) enlarged to the size of images (H, W), its outline interpolated."""
         if self._factor == 1:
             return mask
         factor, result = self._factor, np.zeros(self._shape[:2], np.uint8)
@@ -297,7 +297,7 @@ class BackgroundModel:
         return result.view(np.bool_)
 
     def _smaller_box(self, box: Box | None) -> Box | None:
-        """A region in the pixels of images made smaller, rounded outwards."""
+        """A region in pixels of the reduced image, rounded outwards."""
         if box is None:
             return None
         left, top, right, bottom = box
@@ -305,7 +305,7 @@ class BackgroundModel:
         return left // factor, top // factor, -(-right // factor), -(-bottom // factor)
 
     def _learn_alone(self, background: Image) -> None:
-        """Makes one image (H, W, 3) of the empty scene all that is known."""
+        """Replaces all that was learned by one image (H, W, 3) of the empty scene."""
         self._model = self.settings.new_model()
         self.frames = 0
         for _ in range(self._model.repeats):
@@ -318,14 +318,14 @@ class BackgroundModel:
 
 
 class _Parts:
-    """A background that is put together from parts of images.
+    """A background that is assembled from parts of images.
 
     Args:
         shape: (H, W, 3) of the images.
 
     Attributes:
         unknown: (H, W).
-        changed: whether pixels have become known since this was last set.
+        changed: whether pixels have become known since this was last set to False.
     """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
@@ -340,11 +340,11 @@ class _Parts:
         return np.asarray(np.rint(self._mean), dtype=np.uint8)
 
     def add(self, image: Image, empty: Mask) -> None:
-        """Takes the unknown pixels of an image where it is empty (H, W)."""
+        """Learns the unknown pixels from an image where the scene is empty (H, W)."""
         rows, columns = np.nonzero(empty & self.unknown)
         values = image[rows, columns].astype(np.float32)
         mean, agreeing = self._mean[rows, columns], self._agreeing[rows, columns]
-        # Pixels that disagree begin anew: somebody was there, then or now.
+        # Pixels that disagree start again: somebody was there before, or is there now.
         agreeing[np.abs(values - mean).max(1, initial=0.0) > AGREEMENT] = 0
         agreeing += 1
         self._mean[rows, columns] = mean + (values - mean) / agreeing[:, None]
@@ -375,10 +375,10 @@ def pieces_of(mask: Mask) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
 
 
 def of_one_person(stats: NDArray[np.int32], settings: BackgroundSettings) -> Mask:
-    """Which pieces of a mask belong to its largest one; the first is what lies around them.
+    """Which pieces (N,) of a mask belong to its largest one; piece 0 is the background.
 
     Args:
-        stats: (N, 5) of them, as OpenCV has them.
+        stats: (N, 5) statistics of the pieces by OpenCV.
         settings: how large and near they have to be.
     """
     area = stats[:, cv2.CC_STAT_AREA]
@@ -393,9 +393,9 @@ def of_one_person(stats: NDArray[np.int32], settings: BackgroundSettings) -> Mas
 
 
 def _around(pixels: NDArray[np.bool_ | np.uint8], region: Box | None = None) -> tuple[slice, slice]:
-    """Rows and columns of a region (None: all) with its pixels that are not 0, and a margin.
+    """Rows and columns that bound the nonzero pixels of a region (None: all), with a margin.
 
-    Most of an image is empty, and there are none if all of it is.
+    They are empty if all pixels are 0. They save time because most of an image is empty.
     """
     left, top, right, bottom = region or (0, 0, pixels.shape[1], pixels.shape[0])
     part = pixels[top:bottom, left:right].view(np.uint8)
@@ -409,22 +409,22 @@ def _around(pixels: NDArray[np.bool_ | np.uint8], region: Box | None = None) -> 
 
 
 WIDTH, REACH = 320, 24
-# Gradients count no more than this; Gaussian before the derivative, px.
+# Maximum gradient length; standard deviation of the Gaussian before the derivative, px.
 STRONGEST, SMOOTHING = 200.0, 1.0
-# One image in so many is looked at, and so many in a row must agree.
+# Interval between examined images, and number of these in a row that must agree.
 EVERY, IN_A_ROW = 10, 2
-# Least correlation that counts, and its least excess over that of no shift.
+# Minimum correlation that counts, and its minimum excess over the one without a shift.
 LEAST, MARGIN = 0.3, 0.05
-# Below this fraction of the first correlation without a shift the scene is another.
+# Fraction of the first correlation without a shift below which the scene is another.
 LEFT = 0.4
 
 
 class SceneWatch:
-    """Watches the scene of a camera that is to stand still.
+    """Detects that a camera that should not move has moved.
 
     Attributes:
         moved: whether the camera has moved since the background was taken.
-        shift: distance of the scene from its place in the background, px; NaN: too large to
+        shift: distance of the scene from its place in the background, px; NaN if too large to
             measure.
     """
 
@@ -437,7 +437,7 @@ class SceneWatch:
         self._usual = 0.0
 
     def look(self, image: Image, background: BackgroundModel) -> None:
-        """Takes the next image (H, W, 3), before a background that is known."""
+        """Compares an image (H, W, 3) with a background, unless part of that is unknown."""
         self._count += 1
         if self._count % EVERY != 1 or background.unknown is not None:
             return
@@ -468,7 +468,7 @@ def edges_of(image: Image) -> NDArray[np.float32]:
 def _correlation(
     background: NDArray[np.float32], image: NDArray[np.float32]
 ) -> tuple[float, float, float]:
-    """The shift with the best correlation, px; that correlation; and that of no shift."""
+    """Length of the best shift, px; the correlation there; and the one without a shift."""
     inner = background[REACH:-REACH, REACH:-REACH]
     found = np.nan_to_num(cv2.matchTemplate(image, inner, cv2.TM_CCOEFF_NORMED))
     row, column = np.unravel_index(int(found.argmax()), found.shape)

@@ -1,17 +1,17 @@
 """The empty scene before a camera that stands still, and whether somebody was in it.
 
 A background that was given is the empty scene. One that is learned from images is not, if somebody
-stood in them: the person is missing in the silhouettes, and where the person stood a ghost is left.
-Both look like silhouettes, so what follows from them can not tell. Two other things can:
+stood in them: the person is missing in the silhouettes, and leaves a ghost in the place. Both look
+like silhouettes, so nothing derived from silhouettes shows the fault. Two other cues do:
 
     still     log odds -= dt / STILL          people move; a scene in which nothing does is empty
-    moved     log odds = 0, learned anew      a piece as large as a part of a person has changed
+    moved     log odds = 0, learned again     a piece as large as a part of a person has changed
     outline   log odds -= a(dt) N (u - m)     u: share of the outline of a silhouette at which the
                                               image has the stronger edges, not the background
 
-of somebody in the scene as it was learned. Whoever is before a scene covers it, edges and all; a
-ghost has its edges in the background. Where a detector sees nobody it takes less time, and what
-moves is nobody.
+The log odds are those of somebody in the scene as it was learned. A person in front of a scene
+covers its edges; a ghost has its edges in the background. If a detector sees nobody, less time is
+needed, and things that move are not taken for a person.
 """
 
 from __future__ import annotations
@@ -31,33 +31,33 @@ UNSEEN = (
     'the scene has not been seen empty and still for two seconds; wanted that, or background_file, '
     'or a detector (use_keypoints, or "install-detector")'
 )
-# Time for which somebody in view keeps still, and is unseen by a detector beside, s; what one image
-# says of it at most, nats.
+# Time for which somebody in view keeps still, and for which a detector fails to see them as well,
+# s; maximum change of the log odds by one image, nats.
 STILL, UNDETECTED, MOST = 0.4, 0.1, 3.5
-# Log odds of somebody in the scene below which silhouettes are used, least ones without any
-# silhouette (somebody may sleep, or be a picture), and those below which none is judged, nats.
+# Log odds of somebody in the scene: maximum for silhouettes to be used, minimum without any
+# silhouette (somebody may sleep, or be a picture), and value below which none is judged, nats.
 KNOWN, STILLEST, SURE = -3.5, -5.0, -14.0
-# Blur of images that are compared, px; time that they are compared over, s; least change of a pixel
-# that noise does not make, grey levels; least size of a piece that is part of a person, a share of
-# the image (in empty scenes up to 6e-5; of people who stand 2e-4 to 3e-3 in half a second).
+# Blur of compared images, px; time constant of their mean, s; minimum change of a pixel that is not
+# noise, grey levels; minimum size of a piece that is part of a person, as a fraction of the image
+# (in empty scenes up to 6e-5; of people who stand 2e-4 to 3e-3 in half a second).
 BLUR, MEMORY, CHANGED, PIECE = 1.5, 1.0, 10.0, 2e-4
-# N, m and the time for which errors of the outline last, s. On nine rendered clips u is 0.85 to 1
-# before the empty scene, and 0.25 to 0.66 before their first image, until the person has left the
-# place of the ghost. Least length of the outline, px.
+# N, m, time for which errors of the outline last, s, and minimum length of the outline, px. On nine
+# rendered clips u is 0.85 to 1 with the empty scene as background, and 0.25 to 0.66 with their
+# first image, until the person has left the place of the ghost.
 NATS, UNDECIDED, TAU, OUTLINE = 16.0, 0.75, 0.2, 40
 
 
 class EmptyScene:
-    """Learns the empty scene, and judges it.
+    """Learns the empty scene, and checks whether somebody is in it.
 
     Args:
         background: that was given, or a model that has learned nothing.
-        trusted: whether somebody else answers for it, and learns it.
+        trusted: whether the background is learned, and checked, elsewhere.
 
     Attributes:
         background: the scene as it is known.
-        seen: whether it was seen long enough to have silhouettes, which are judged from then on.
-        log_odds: of somebody in it, nats.
+        seen: whether it was seen long enough for silhouettes, which are judged from then on.
+        log_odds: log odds of somebody in it, nats.
     """
 
     def __init__(self, background: BackgroundModel, *, trusted: bool = False) -> None:
@@ -76,21 +76,21 @@ class EmptyScene:
 
     @property
     def wants(self) -> str:
-        """What is missing until silhouettes are used, in words."""
+        """Message about what silhouettes still need; '' if nothing."""
         return '' if self.known else UNSEEN
 
     @property
     def is_of_somebody(self) -> bool:
-        """Whether it was seen, and more likely than not somebody is in it."""
+        """Whether it was seen, and somebody is more likely than not in it."""
         return self.seen and self.log_odds > 0.0
 
     def learn(self, image: Image, stamp: int, detected: bool | None = None) -> None:
-        """Takes an image (H, W, 3), unless a detector sees somebody in it.
+        """Learns from an image (H, W, 3), unless a detector sees somebody in it.
 
         Args:
             image: of the scene.
             stamp: of the image, ns; later than the one before.
-            detected: whether a detector, or a segmenter, sees somebody; None: it does not say.
+            detected: whether a detector, or a segmenter, sees somebody; None if unknown.
         """
         if self.log_odds == -math.inf or detected:
             return
@@ -107,7 +107,7 @@ class EmptyScene:
         self.background.learn(image)
 
     def judge(self, image: Image, stamp: int) -> None:
-        """Takes an image (H, W, 3) before the scene that was learned, and its silhouette."""
+        """Updates the log odds by the outline of the silhouette in an image (H, W, 3)."""
         if not self.seen or self.log_odds <= SURE:
             return
         now, size = edges_of(image), image.shape[1::-1]

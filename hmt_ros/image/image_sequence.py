@@ -6,10 +6,10 @@ Errors of images last, so a cue g of an image counts with its share a_g of the t
 before (`inference.error_model`), as in the filter; an exchange of sides counts whole. Along a
 motion a lasting error does no harm: by `of_changes` the terms of the image count with their share
 of changes, and covariances grow by `CueErrors.lasting` afterwards. Keypoints count as before: their
-errors wander, and a motion would follow.
+errors drift, and a motion would follow them.
 
 Each image has the lengths and the flesh that its own poses were found with: later estimates of
-these move the root along the line of sight, which neighbours would take for motion.
+these move the root along the line of sight, which neighbouring images would take for motion.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from hmt_ros.inference.error_model import ERRORS, seconds
 
 @dataclass(frozen=True, eq=False)
 class SeenImage:
-    """What an image shows of a person, as far as it is believed.
+    """The evidence of one image about a person, as far as it is believed.
 
     Attributes:
-        likelihood: of images of this person.
-        observation: of the image.
+        likelihood: likelihood of images of this person.
+        observation: evidence of the image.
         known: further terms of the pose: gravity, floor.
     """
 
@@ -46,7 +46,7 @@ class SeenImage:
     known: tuple[FrameTerm | GroundTerm, ...] = ()
 
     def levelled(self, level: Array) -> SeenImage:
-        """The same, of poses whose root angles are measured against other axes."""
+        """The same image for poses whose root angles are relative to other axes."""
         body = self.likelihood.body
         if np.array_equal(body.level, level):
             return self
@@ -58,8 +58,8 @@ class ImageSequence:
     """-log p(r_t | x_t) of T images; an `EnergyTerm` whose rows are times.
 
     Attributes:
-        images: T of them.
-        shares: T times the shares a_g by name of the cue.
+        images: the T images.
+        shares: shares a_g of each image, by name of the cue.
     """
 
     images: Sequence[SeenImage]
@@ -86,13 +86,13 @@ class ImageSequence:
 
     @property
     def times(self) -> int:
-        """T."""
+        """Number T of images."""
         return len(self.images)
 
     def energy(
         self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
     ) -> Energy:
-        """See `EnergyTerm`; the rows are times. Asked for a gradient, it returns a Hessian too."""
+        """See `EnergyTerm`; the rows are times. All derivatives are returned, or none."""
         n, d = x.shape
         asked = n if derivatives else 0
         value, gradient, hessian = np.empty(n), np.empty((asked, d)), np.empty((asked, d, d))
@@ -113,7 +113,7 @@ class ImageSequence:
         """The sums of terms of each time, and the factors on them."""
         result = []
         for image, share in zip(self.images, self.shares, strict=True):
-            # Whoever asks may do so from several threads, which are shared out already.
+            # Callers may run in several threads, which already use all cores.
             likelihood = replace(image.likelihood, threads=1)
             seen = likelihood.seen(
                 image.observation, share=share['keypoints'], lifted_share=share['lifted']

@@ -1,11 +1,11 @@
-"""Depths of joints from a depth image, for a start: the pixels of the joints are known.
+"""Depths of joints with known pixels from a depth image, for the start of a track.
 
 A joint lies behind the skin that its pixel shows, by about the radius of the flesh there:
 
     z_j = D(u_j) + r_j +- sigma_j,   sigma_j^2 = (r_j / 2)^2 + DEPTH_SIGMA^2
 
 D is a low quantile of the depths around the pixel, as limbs are thin and the background is behind
-them. A thing before the joint, or a depth beside it, is an outlier; kernels are robust.
+them. An object in front of the joint, or a depth beside it, is an outlier; kernels are robust.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from hmt_ros.image.terms.depth import usable_depths
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Index
 
-# Pixels on every side of a joint's that are looked at, and the quantile of their depths.
+# Margin of the window around the pixel of a joint, px, and quantile of the depths in it.
 MARGIN, DEPTH_QUANTILE = 2, 0.25
 # Standard deviation of the depth of a joint besides its flesh, m.
 DEPTH_SIGMA = 0.03
 # Width of the Geman-McClure kernel, in standard deviations.
 KERNEL_SCALE = 4.0
-# Minimum number of joints of the trunk whose depth tells where a person is.
+# Minimum number of points of the trunk with a depth that locate a person.
 MIN_JOINTS = 3
 # Quantile of their depths, below the median as the background is behind; number of iterations.
 TRUNK_QUANTILE, ITERATIONS = 0.35, 2
 
 
 def depths_of(depth: NDArray[np.floating] | None) -> ImageMap | None:
-    """The map of a depth image (H, W), m; None: there is none, or nothing was measured."""
+    """The map of a depth image (H, W), m; None if nothing was measured."""
     if depth is None:
         return None
     usable = usable_depths(depth)
@@ -49,7 +49,7 @@ class JointDepths:
     """Depths of some joints from a depth image.
 
     Attributes:
-        joints: (M,) of the skeleton.
+        joints: (M,) joints of the skeleton.
         depths: (M,) along the axis of the camera, m.
         sigma: (M,) their standard deviations, m.
     """
@@ -59,7 +59,7 @@ class JointDepths:
     sigma: Array
 
     def residuals(self, depths: Array) -> tuple[Array, Array, Array]:
-        """Energy, its derivative and its curvature (M,) by the depths (M,) of the joints, m."""
+        """Energies (M,) of depths (M,) of the joints, m, and their derivatives and curvatures."""
         error = (depths - self.depths) / self.sigma
         shrink = 1.0 / (1.0 + (error / KERNEL_SCALE) ** 2)
         curvature = shrink**2 / self.sigma**2
@@ -80,7 +80,7 @@ def joint_depths(body: Body, keypoints: Keypoints, depths: ImageMap | None) -> J
 def moved_to_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap | None) -> Array:
     """Poses (N, d) moved along their rays to where the depth image shows their trunks.
 
-    A pose with too few measurements stays where it is.
+    A pose with too few measurements does not move.
     """
     names = [name for pair in body.trunk_pairs for name in pair]
     if depths is None or not names:
@@ -90,7 +90,7 @@ def moved_to_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap | 
     result = poses.copy()
     for _ in range(ITERATIONS):
         joints = body.joint_positions(result)[:, index]
-        # Joints of a pose that is too near lie beside the person; points half way in may not.
+        # Joints of a pose that is too near lie beside the person; points nearer the middle may not.
         inside = 0.5 * (joints + joints.mean(1, keepdims=True))
         for pose, points in zip(result, np.concatenate([joints, inside], axis=1), strict=True):
             skin = _depths_at(depths, camera.project(points))
@@ -106,7 +106,7 @@ def _depths_at(depths: ImageMap, pixels: Array) -> Array:
     values = depths.values[0]
     height, width = values.shape
     steps = np.arange(-MARGIN, MARGIN + 1)
-    # Pixels far outside, or behind the camera, stay outside.
+    # Clip pixels far outside, or behind the camera, to ones that are still outside.
     centres = np.clip(np.nan_to_num(pixels, nan=-1e6), -1e6, 1e6)
     columns, rows = (np.rint(centres) - [depths.left, depths.top]).astype(np.intp).T
     rows = (rows[:, None, None] + steps[:, None]).repeat(len(steps), axis=2)

@@ -11,9 +11,9 @@ from hmt_ros.body.body import Body
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
 
-# Fewest keypoints that make a person.
+# Minimum number of keypoints of a person.
 FEWEST_KEYPOINTS = 6
-# Confidence of a keypoint whose position is trusted.
+# Minimum confidence of a keypoint whose position is trusted.
 MIN_CONFIDENCE = 0.5
 # Detectors find small people in the legs of a table and in leaves, with full confidence. Keypoints
 # of a person at this magnification, px/m, are no evidence; at twice this, they count in full.
@@ -21,11 +21,11 @@ MIN_MAGNIFICATION = 22.0
 
 
 def keypoint_evidence(keypoints: Keypoints, body: Body) -> float:
-    """Evidence of a detector for a person in view, from -1, nobody, to 1.
+    """Evidence of a detector for a person in view, from -1 (nobody) to 1.
 
     It is 1 where the confidences have at least the sum of the fewest trusted keypoints that make a
-    person, and -1 below a third of that. Fewer joints, and a person of a few pixels, are evidence
-    neither of a person nor of an empty image.
+    person, and -1 below a third of that. With fewer joints, or for a person of a few pixels, it is
+    at most 0.
     """
     seen = keypoints.confidences[keypoints.seen]
     most = 0.0
@@ -38,7 +38,7 @@ def keypoint_evidence(keypoints: Keypoints, body: Body) -> float:
 def suffices(keypoints: Keypoints | None, body: Body) -> bool:
     """Whether keypoints of one image fix place and facing direction of a person.
 
-    They do with all joints of the trunk but one.
+    They must include all joints of the trunk, or all but one.
     """
     if keypoints is None:
         return False
@@ -49,7 +49,7 @@ def suffices(keypoints: Keypoints | None, body: Body) -> bool:
 
 
 def shows_a_part(keypoints: Keypoints | None, body: Body) -> bool:
-    """Whether keypoints are a person, and fix the facing direction."""
+    """Whether keypoints show a person, and fix the facing direction."""
     if keypoints is None or keypoint_evidence(keypoints, body) <= 0.0:
         return False
     names = _confident(keypoints)
@@ -62,7 +62,7 @@ def _confident(keypoints: Keypoints) -> set[str]:
 
 
 def _magnification(keypoints: Keypoints, body: Body) -> float:
-    """About how many px a metre has at the person: the extent of joints over that in standing."""
+    """Approximate magnification, px/m: the extent of the joints over that of a standing person."""
     standing = _standing(body)
     known = [i for i in np.flatnonzero(keypoints.seen) if keypoints.names[i] in standing]
     if not known:

@@ -29,8 +29,8 @@ class Landmark:
     """A point of a person that detectors find.
 
     Attributes:
-        name: canonical.
-        joint: of our bodies that it is at, or near; '': none.
+        name: canonical name.
+        joint: joint of our bodies at or near the landmark; '' if there is none.
         offset: (3,) from the joint in the frame of the joint's segment, m, of a person of 1.7 m.
         sigma: standard deviation of each component of the offset over people, m.
     """
@@ -46,9 +46,9 @@ class Scheme:
     """The landmarks of a family of detectors.
 
     Attributes:
-        name: of the scheme.
-        names: of the landmarks, in the detectors' order.
-        landmarks: of the names.
+        name: name of the scheme.
+        names: names of the landmarks, in the detectors' order.
+        landmarks: the landmarks, in the same order.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Scheme:
     landmarks: tuple[Landmark, ...]
 
     def landmark(self, name: str) -> Landmark | None:
-        """The landmark of a name; None: the scheme does not have it."""
+        """The landmark of a name; None if the scheme does not have it."""
         return self.landmarks[self.names.index(name)] if name in self.names else None
 
 
@@ -96,9 +96,9 @@ def schemes() -> Mapping[str, Scheme]:
 
 @cache
 def unnamed_orders() -> Mapping[int, tuple[str, ...]]:
-    """Schemes that lists without names may have, the usual one first, by their number of points.
+    """Possible schemes of lists without names, the usual one first, by their number of points.
 
-    Those of fewer names are the beginning of the list.
+    A scheme of fewer names covers the beginning of the list.
     """
     return {int(count): tuple(names) for count, names in _table()['unnamed'].items()}
 
@@ -115,7 +115,7 @@ def bone_lengths() -> Mapping[tuple[str, str], tuple[float, float]]:
 
 
 def scheme_of(names: Sequence[str], scheme: str = AUTO) -> Scheme | None:
-    """The scheme of keypoints; None: their names are those of joints.
+    """The scheme of keypoints; None if their names are those of joints.
 
     Args:
         scheme: name of a scheme, 'joints', or 'auto': see `recognised`.
@@ -135,9 +135,9 @@ def scheme_of(names: Sequence[str], scheme: str = AUTO) -> Scheme | None:
 
 
 def recognised(names: Sequence[str]) -> Scheme | None:
-    """The scheme that has all of the names, the smallest, if a face or a spine is among them.
+    """The smallest scheme that has all of the names, if a face or a spine is among them.
 
-    Limbs and trunk have the same names everywhere: alone they are taken for joints.
+    Limbs and trunk have the same names in all schemes: without others they are names of joints.
     """
     fitting = [x for x in schemes().values() if set(names) <= set(x.names)]
     found = min(fitting, key=lambda x: len(x.names), default=None)
@@ -147,7 +147,7 @@ def recognised(names: Sequence[str]) -> Scheme | None:
 def landmarks_of(
     names: Sequence[str], joints: Sequence[str], scheme: str = AUTO
 ) -> list[Landmark | None]:
-    """The landmarks of keypoints by their names; None: a joint of the body, or unknown.
+    """The landmarks of keypoints by their names; None for a joint of the body or an unknown name.
 
     Args:
         joints: of the body; outside schemes a name of one of them means this joint.
@@ -163,7 +163,7 @@ def landmarks_of(
 
 
 def landmark_called(name: str) -> Landmark | None:
-    """The landmark of a name in the first scheme that has it; None: no scheme has the name."""
+    """The landmark of a name in the first scheme that has it; None if no scheme does."""
     found = (scheme.landmark(name) for scheme in schemes().values())
     return next((landmark for landmark in found if landmark is not None), None)
 
@@ -180,7 +180,7 @@ def position_deviations(scheme: str | None) -> Mapping[str, float]:
     """Standard deviations of depths of a detector, by the kind of the joint, m.
 
     Args:
-        scheme: name of the detector's; None or one that was not measured: the usual ones.
+        scheme: name of the detector's scheme; None or an unmeasured one gives the usual deviations.
     """
     content = _table()['positions']
     return {**content['usual'], **content.get(scheme, {})}
@@ -188,7 +188,7 @@ def position_deviations(scheme: str | None) -> Mapping[str, float]:
 
 @cache
 def exchange_rates() -> Array:
-    """(E, E) rates per second at which a detector goes from one exchange of sides to another."""
+    """(E, E) rates per second at which a detector changes between exchanges of sides."""
     rates = np.array(_table()['exchanges']['rates'], dtype=np.float64)
     return rates - np.diag(rates.sum(1))
 

@@ -1,13 +1,13 @@
-"""Whole poses that were lifted from an image: a mixture over joints relative to the hips.
+"""Whole poses lifted from an image: a mixture over joints relative to the hips.
 
     p(y) = sum_c w_c prod_ja N(y_ja; m_cja, s_cja^2),    y_j: joint j from the middle of the hips
 
-The axes a are those of a person: across the line of sight, and along it. Experts (`experts.lifter`)
-give several components; a network that guesses one pose gives one without its uncertainty, which
-is learned (`keypoint_schemes.yaml`).
+The axes a lie across and along the line of sight to the person. Experts (`experts.lifter`) give
+several components; a network that estimates one pose gives one component without its uncertainty,
+which is learned (`keypoint_schemes.yaml`).
 
-Positions are those of a person of some lengths. Only the directions of bones count: for a person
-of other lengths every bone is scaled to its own length.
+Positions belong to a person of certain bone lengths. Only the directions of bones count: for
+another person every bone is scaled to that person's length.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ WHOLE = {
         for side in ('left', 'right')
     ),
 }
-# Deviation of a joint without an estimate, m.
+# Standard deviation of a joint without an estimate, m.
 UNKNOWN = 0.5
 HIPS = ('left_hip', 'right_hip')
-# The joint that each joint hangs on by a bone; the others hang on the middle of the hips.
+# Parent of each kind of joint; the parent of all others is the middle of the hips.
 CARRIERS = {
     'head': 'neck',
     'shoulder': 'neck',
@@ -60,7 +60,7 @@ class LiftedPoses:
         means: (C, J, 3) from the middle of the hips, along the axes, m.
         deviations: (C, J, 3) standard deviations along the axes, m.
         axes: (3, 3) unit vectors in rows, camera frame; the last one is the line of sight.
-        lengths: (J,) of the bones that the joints hang on, of the person whose joints they are, m.
+        lengths: (J,) of the bones from the parents to the joints in the means, m.
     """
 
     joints: tuple[str, ...]
@@ -78,7 +78,7 @@ class LiftedPoses:
 
     @property
     def are_whole(self) -> bool:
-        """Whether a pose can be made of them alone: all joints but toes and hands are there."""
+        """Whether they determine a pose alone: only toes and hands may be missing."""
         return {*self.joints} >= WHOLE
 
     def of_joints(self, names: Sequence[str]) -> LiftedPoses:
@@ -94,7 +94,7 @@ class LiftedPoses:
         )
 
     def sized(self, skeleton: Skeleton) -> Array:
-        """The means (C, J, 3) of a person with the lengths of a skeleton that has the joints."""
+        """The means (C, J, 3) with the bone lengths of a skeleton that has the joints."""
         return self._with_lengths(bone_lengths(skeleton, self.joints))
 
     def _with_lengths(self, own: Array) -> Array:
@@ -111,7 +111,7 @@ class LiftedPoses:
         return self._with_lengths(own)
 
     def exchanged(self) -> LiftedPoses:
-        """The mixture with exchanged sides: left for right, and away for towards."""
+        """The mixture with left and right exchanged, and depths negated."""
         swapped = [self.joints.index(other_side(name)) for name in self.joints]
         mirror = np.array([1.0, 1.0, -1.0])
         return LiftedPoses(
@@ -125,10 +125,10 @@ class LiftedPoses:
 
 
 def pooled(opinions: Sequence[LiftedPoses]) -> LiftedPoses:
-    """One mixture of several opinions of one pose, each of which counts the same.
+    """One mixture from several estimates of one pose, with equal weights.
 
-    They read the same image, so that none confirms another: the density is the mean of theirs. A
-    joint that one opinion lacks may, by that opinion, be anywhere.
+    They use the same image, so they are not independent: the density is their mean. A joint that
+    an estimate lacks has the deviation `UNKNOWN` in its components.
     """
     first = opinions[0]
     if len(opinions) == 1:
@@ -154,15 +154,16 @@ def from_positions(
     deviations: Mapping[str, float],
     seen: Mask | None = None,
 ) -> LiftedPoses | None:
-    """The one pose that a network guesses; None: it has no hips, or nothing else.
+    """The one pose that a network estimates; None if it lacks hips, or has nothing else.
 
     Args:
-        joints: (n,) names of joints; of several of one name the first counts. A joint whose other
-            side is unknown does not count: exchanged, it would be the other.
+        joints: (n,) names of joints; the first of equal names counts. A joint whose other side is
+            unknown does not count, because sides may be exchanged.
         positions: (n, 3) m, along the axes of the camera from any origin; NaN: unknown.
-        axes: (3, 3) of the person's view, in rows, camera frame.
-        deviations: of the depths of joints, by their kind, m.
-        seen: (n,) joints that the network has seen; the others may be anywhere. None: all.
+        axes: (3, 3) as in `LiftedPoses`.
+        deviations: standard deviations of the depths of joints by their kind, m.
+        seen: (n,) joints that the network has seen; the others have the deviation `UNKNOWN`. None:
+            all were seen.
     """
     known: dict[str, int] = {}
     for i in np.flatnonzero(np.isfinite(positions).all(1)).tolist():
@@ -189,7 +190,7 @@ def from_positions(
 
 @lru_cache(maxsize=64)
 def shared(joints: tuple[str, ...], others: tuple[str, ...]) -> tuple[Index, Index]:
-    """Rows of the joints that are in both, in each."""
+    """Rows of the common joints in the first and in the second sequence."""
     rows = [(i, others.index(name)) for i, name in enumerate(joints) if name in others]
     own, theirs = np.array(rows, dtype=np.intp).reshape(-1, 2).T
     return own, theirs
@@ -197,7 +198,7 @@ def shared(joints: tuple[str, ...], others: tuple[str, ...]) -> tuple[Index, Ind
 
 @lru_cache(maxsize=64)
 def ordered(joints: tuple[str, ...]) -> Index:
-    """(J, 2) rows of joints and of those that they hang on (-1: the middle of the hips), first."""
+    """Rows (J, 2) of joints and their parents (-1: the middle of the hips), parents first."""
     places = {name: i for i, name in enumerate(joints)}
     result: list[tuple[int, int]] = []
     done: set[str] = set()
@@ -217,7 +218,7 @@ def ordered(joints: tuple[str, ...]) -> Index:
 
 
 def carrier_of(name: str, joints: Sequence[str]) -> str:
-    """The joint that a joint hangs on, of some joints; '': the middle of the hips."""
+    """The nearest ancestor of a joint among some joints; '' for the middle of the hips."""
     side, _, kind = name.rpartition('_')
     carrier = CARRIERS.get(kind, '')
     while carrier:
@@ -230,7 +231,7 @@ def carrier_of(name: str, joints: Sequence[str]) -> str:
 
 @lru_cache(maxsize=16)
 def bone_lengths(skeleton: Skeleton, joints: tuple[str, ...]) -> Array:
-    """Lengths (J,) of the bones that joints hang on, at rest, m."""
+    """Lengths (J,) of the bones from the parents to the joints, at rest, m."""
     places = forward(skeleton, np.zeros((1, skeleton.dimension))).joints()[..., 0]
     chosen: Index = skeleton.joint_index(joints)
     middle = places[skeleton.joint_index(HIPS)].mean(0)
@@ -238,7 +239,7 @@ def bone_lengths(skeleton: Skeleton, joints: tuple[str, ...]) -> Array:
 
 
 def bones(joints: tuple[str, ...], places: Array, origin: Array) -> Array:
-    """Bones (J, 3) that joints at places (J, 3) hang on; the origin: of those that hang on none."""
+    """Bones (J, 3) to joints at places (J, 3) from their parents, or else from the origin."""
     rows, carriers = ordered(joints).T
     result = np.empty_like(places)
     result[rows] = places[rows] - np.where(carriers[:, None] < 0, origin, places[carriers])

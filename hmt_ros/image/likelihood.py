@@ -38,7 +38,7 @@ from hmt_ros.inference.arrays import Array
 
 OFF = TermSettings(0.0, 1.0, 1.0)
 
-# One field a term of the registry, so that a new term needs no line here.
+# One field per term of the registry, so that a new term needs no line here.
 _ImageTerms: Any = make_dataclass(
     '_ImageTerms',
     [(term.name, TermSettings, field(default=term.settings)) for term in TERMS],
@@ -60,7 +60,7 @@ class LikelihoodSettings(_ImageTerms):  # type: ignore[misc]
 
     @classmethod
     def of_terms(cls, **settings: TermSettings) -> LikelihoodSettings:
-        """Settings with the image terms and keypoints that are named, all others switched off."""
+        """Settings with the named image terms and keypoints, all others switched off."""
         names = [*(term.name for term in TERMS), 'keypoints']
         chosen: dict[str, Any] = {name: settings.get(name, OFF) for name in names}
         return cls(**chosen)
@@ -88,11 +88,11 @@ class ImageLikelihood:
 
     Attributes:
         body, camera: the person, and the camera that sees the person.
-        settings: of the terms.
+        settings: settings of the terms.
         parts: the parts of the flesh that are compared with the image; None: all.
         occluders: the parts that hide others; None: all.
-        threads: number of threads that share poses; 0: one a core, see `in_threads`. Results do not
-            depend on it.
+        threads: number of threads that share poses; 0: one per core, see `in_threads`. Results do
+            not depend on it.
     """
 
     body: Body
@@ -130,9 +130,10 @@ class ImageLikelihood:
         """The term of the keypoints of an observation that has some.
 
         Args:
-            exchanges: of sides, see `KeypointTerm`; None: as usual for detectors.
-            share: of the energy that counts, beside the prior of the exchanges.
-            lifted_share: the same of the energy of lifted poses.
+            exchanges: log probabilities of exchanges of sides, see `KeypointTerm`; None: the usual
+                ones of detectors.
+            share: factor on the energy, but not on the prior of the exchanges.
+            lifted_share: factor on the energy of lifted poses.
         """
         if exchanges is None and share == 1.0:
             return usual_keypoints(self, observation, lifted_share)
@@ -152,7 +153,7 @@ class ImageLikelihood:
 
     @cached_property
     def priors(self) -> tuple[AnglePrior | MixturePrior | SelfIntersection, ...]:
-        """The terms without any image: prior of joint angles, parts that do not intersect."""
+        """The terms that need no image: prior of joint angles, and self-intersection."""
         s = self.settings
         if not np.isfinite(s.self_intersection_sigma):
             return (self.pose_prior,)
@@ -202,10 +203,10 @@ class ObservedImage:
     """The image terms of an observation.
 
     Attributes:
-        likelihood: of the terms.
-        observation: of the image.
-        explained: (N, M) or (1, M) maximum energy of each sample of the outline, because something
-            else explains it; None: unlimited.
+        likelihood: likelihood that the terms belong to.
+        observation: evidence of the image.
+        explained: (N, M) or (1, M) maximum energy of each sample of the outline, which something
+            else may explain; None: unlimited.
     """
 
     likelihood: ImageLikelihood
@@ -214,7 +215,7 @@ class ObservedImage:
 
     @cached_property
     def compiled(self) -> dict[str, Any]:
-        """What compiled code reads of them: members of `pose_energy.Compiled`."""
+        """The terms as compiled code reads them: fields of `pose_energy.Compiled`."""
         found = _inputs(self.likelihood.settings, self.observation)
         if self.explained is not None:
             found = found | {
@@ -226,7 +227,7 @@ class ObservedImage:
         return found | {'model': self.likelihood.model}
 
 
-# An image is compared with many sets of poses, and with parts of the body.
+# Cached because an image is compared with many sets of poses, and with parts of the body.
 @lru_cache(maxsize=4)
 def _inputs(settings: LikelihoodSettings, observation: Observation) -> dict[str, Any]:
     """The inputs of all terms of an image, and which of them are on."""
@@ -255,13 +256,13 @@ def _inputs(settings: LikelihoodSettings, observation: Observation) -> dict[str,
 def usual_keypoints(
     likelihood: ImageLikelihood, observation: Observation, lifted_share: float
 ) -> KeypointTerm:
-    """The term of keypoints whose exchanges are as usual, the same at each call."""
+    """The keypoint term with the usual exchanges; repeated calls return the same object."""
     return likelihood.keypoint_term(observation, usual_exchanges(), 1.0, lifted_share)
 
 
 @lru_cache(maxsize=4)
 def observed(likelihood: ImageLikelihood, observation: Observation) -> ObservedImage:
-    """The image terms of an observation, the same at each call."""
+    """The image terms of an observation; repeated calls return the same object."""
     return ObservedImage(likelihood, observation)
 
 

@@ -22,7 +22,7 @@ from hmt_ros.inference.threads import together
 
 Box = tuple[int, int, int, int]
 
-# Pixels around the silhouette that evidence is taken from.
+# Margin around the silhouette within which evidence is taken, px.
 MARGIN = 48
 
 
@@ -31,11 +31,11 @@ class Beliefs:
     """Probabilities that the cues of an image show the person: factors on their energies.
 
     Attributes:
-        silhouette: that of the silhouette.
-        keypoints: (G,) of the groups of keypoints, see `terms.keypoints`.
-        depth: of the depths.
-        segments: (S,) by the name of an image term, or of the keypoints, of its parts that belong
-            to each segment, beside those above; all are believed where there are none.
+        silhouette: probability of the silhouette.
+        keypoints: (G,) probabilities of the groups of keypoints, see `terms.keypoints`.
+        depth: probability of the depths.
+        segments: (S,) further factors on the parts of an image term, or of the keypoints, that
+            belong to each segment, by name of the term; without an entry all are 1.
     """
 
     silhouette: float
@@ -48,7 +48,7 @@ class Beliefs:
         return {'coverage': self.silhouette, 'depth': self.depth}.get(name, 1.0)
 
     def of_segments(self, name: str) -> Array:
-        """Factors (S,) on the energies of an image term or of keypoints; (0,): all are 1."""
+        """Factors (S,) on the energies of an image term or of keypoints; (0,) if all are 1."""
         return self.segments.get(name, NO_FACTORS)
 
 
@@ -57,18 +57,18 @@ class Observation:
     """An image and the evidence taken from it.
 
     Attributes:
-        silhouette: (H, W) foreground, or None: unknown, or not believed.
-        keypoints: joints seen in the image, or None.
-        evidence: by the name of the term; terms without evidence in the image are left out.
+        silhouette: (H, W) foreground; None if unknown, or not believed.
+        keypoints: joints seen in the image; None if unknown.
+        evidence: evidence by name of the term; terms without evidence in the image are left out.
         foreground: (H, W) pixels that differ from the background, believed or not; None: unknown.
         depths: m, believed or not; None: unknown.
-        flow: from the image before, two channels, px; None: there is none.
-        others: (H, W) pixels that somebody else covers or may cover; None: there are none.
-        hidden: (S,) segments that something else covers, of which the image says nothing; None:
-            none.
-        beliefs: in the cues; None: all are believed.
-        magnification: px for a metre at the distance of the person; 0: unknown, the contours of
-            people are taken to be as the model's.
+        flow: optical flow from the image before, two channels, px; None if there is none.
+        others: (H, W) pixels that somebody else covers or may cover; None if there are none.
+        hidden: (S,) segments that something else covers, so that the image is no evidence about
+            them; None if there are none.
+        beliefs: probabilities of the cues; None: all are believed.
+        magnification: px/m at the distance of the person; 0 if unknown: contours of people are then
+            assumed to equal the model's.
     """
 
     silhouette: Mask | None = None
@@ -83,7 +83,7 @@ class Observation:
     magnification: float = 0.0
 
     def factors(self, name: str) -> Array:
-        """Factors (S,) on the energies of a term at each segment; (0,): all are 1."""
+        """Factors (S,) on the energies of a term at each segment; (0,) if all are 1."""
         believed = NO_FACTORS if self.beliefs is None else self.beliefs.of_segments(name)
         if self.hidden is None:
             return believed
@@ -91,7 +91,7 @@ class Observation:
 
     @property
     def outline(self) -> Outline | None:
-        """Samples on the outline of the silhouette, the evidence of the coverage."""
+        """Samples on the outline of the silhouette, the evidence of the coverage term."""
         return self.evidence.get('coverage')
 
 
@@ -115,15 +115,15 @@ def observe(
         window: (left, top, right, bottom) where the person is expected, for images without a
             silhouette; the whole image when None.
         last_image: the image before, of the same size, that the optical flow starts from; None:
-            there is no flow.
+            the flow is not computed.
         wanted: names of terms; None: all.
-        unsure: (H, W) pixels that may belong to the silhouette; None: none.
-        others: (H, W) pixels that somebody else covers; None: none.
+        unsure: (H, W) pixels that may belong to the silhouette; None if there are none.
+        others: (H, W) pixels that somebody else covers; None if there are none.
         depth: (H, W) depth along the axis of the camera, m; None: unknown. 0, NaN and values out of
             range are no evidence.
 
     Raises:
-        ValueError: shapes that contradict each other.
+        ValueError: the image is not (H, W, 3) uint8, or the shapes contradict each other.
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         raise ValueError(f'image must be (H, W, 3) uint8, saw {image.shape} {image.dtype}')
@@ -134,13 +134,13 @@ def observe(
     known = silhouette if silhouette is not None and silhouette.any() else None
     box = window
     if known is not None:
-        # Somebody may be anywhere behind the others.
+        # The person may be anywhere behind the others.
         box = _box(known if others is None else known | others)
     left, top, right, bottom = _grown(box, MARGIN, image.shape)
     inside = slice(top, bottom), slice(left, right)
 
     def cut(whole: NDArray[Any] | None) -> Any:
-        """The window, of a mask with 0 and 1."""
+        """The window of an array; a mask becomes 0 and 1."""
         if whole is None:
             return None
         part = np.ascontiguousarray(whole[inside])

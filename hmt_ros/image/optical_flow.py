@@ -21,21 +21,21 @@ from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.image_term import ImageWindow
 
-# Smaller images, px, have a flow of 0.
+# Minimum side of an image with a flow, px; the flow of smaller ones is 0.
 SMALLEST = 32
 
 
 def optical_flow(window: ImageWindow) -> ImageMap | None:
     """Dense flow from the last image to this one, two channels, px [Kroeger et al., ECCV 2016].
 
-    NaN on pixels of somebody else; None: there is no last image.
+    NaN on pixels of somebody else; None if there is no last image.
     """
     if window.last_image is None:
         return None
     grey = [cv2.cvtColor(x, cv2.COLOR_BGR2GRAY) for x in (window.last_image, window.image)]
     if min(grey[0].shape) < SMALLEST:
         return window.as_map(np.zeros((2, *grey[0].shape), np.float32))
-    # The stubs do not know that there may be no flow to start from.
+    # The type stubs lack that the initial flow may be None.
     method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     with without_ipp():
         flow = method.calc(grey[0], grey[1], None)
@@ -48,7 +48,7 @@ def optical_flow(window: ImageWindow) -> ImageMap | None:
 
 @contextmanager
 def without_ipp() -> Iterator[None]:
-    """OpenCV without Intel's IPP in this thread: that resizes in other ways on other processors."""
+    """Disable Intel's IPP in OpenCV in this thread: it resizes differently between processors."""
     before = cv2.ipp.useIPP()
     cv2.ipp.setUseIPP(False)
     try:
@@ -62,8 +62,8 @@ class FlowTerm:
     """The energy of poses against the flow.
 
     Attributes:
-        points: of K poses in the image before, one for each problem.
-        flow: from that image to this one.
+        points: surface points of K poses in the image before, one pose per problem.
+        flow: flow from that image to this one.
         weight: w, number of independent measurements.
     """
 

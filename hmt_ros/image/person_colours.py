@@ -1,4 +1,4 @@
-"""The colours of a person, whether an image shows them anywhere, and what has moved since.
+"""The colours of a person, whether an image shows them, and whether the person has moved.
 
     p(M | colour) = h_M / (h_M + h_around)              ratio of two histograms
     B(x) = mean of p(M | colour) over a box at x        as large as the model
@@ -6,17 +6,17 @@
 
 M are the pixels that the model covers. `here` and `elsewhere` are the usual value of B where the
 person is, and its usual maximum over boxes beside the person: the score is about 1 where the image
-shows somebody in these colours, wherever that is, and about 0 in a room without the person. Colours
-are no evidence where the two are alike, or where the image has other colours than the images before
-it: a covered lens, another light.
+shows somebody in these colours anywhere, and about 0 in a room without the person. Colours are no
+evidence if the two are alike, or if the image has other colours than the images before it, as with
+a covered lens or another light.
 
 Their absence is evidence against the person only in the scene that they were learned in:
 
     stillness = 1 - changed pixels beyond the model / (LARGEST_CHANGE pixels of the model), >= 0
 
-Otherwise `elsewhere` belongs to another scene: the camera has moved, and the lost colours may be
-those of a thing that the model covered. A person who moves beyond the model changes as many pixels.
-A colour that no image had may belong to the person, who turns about.
+After a change `elsewhere` belongs to another scene: the camera has moved, and the lost colours may
+be those of an object that the model covered. A person who moves beyond the model changes as many
+pixels. A colour that no earlier image had may belong to the person, who has turned around.
 """
 
 from __future__ import annotations
@@ -36,30 +36,30 @@ from hmt_ros.inference.arrays import Array, Image, Mask
 MEMORY_TIME = 2.0
 # Time from one learning of the colours to the next, s: they hardly change.
 LEARNING_INTERVAL = 0.1
-# Changed pixels beyond the model, relative to those of the person, or to those beyond if they are
-# fewer, from which the scene is another one. A shadow goes with the person.
+# Changed pixels beyond the model above which the scene is another one, as a fraction of the pixels
+# not beyond it, or of those beyond it if they are fewer. A shadow moves with the person.
 LARGEST_CHANGE = 0.25
 # Minimum difference between `here` and `elsewhere` that is evidence, a probability.
 MIN_CONTRAST = 0.15
 # Bins of a colour channel, whose values are 0 to 255.
 BINS = 8
-# Fractions of the pixels of a model that change where it moves, and at most where nothing does.
+# Minimum fraction of a model's pixels that change if the person moves, and maximum if nothing does.
 MOVED_FRACTION, UNMOVED_FRACTION = 0.03, 0.005
-# How many times denser changes are on a person who moves than elsewhere.
+# Minimum ratio of the density of changes on a moving person to that elsewhere.
 MOTION_DENSITY_RATIO = 8.0
 # Minimum standard deviation of the pixels of a model whose motion can be seen, grey levels.
 MIN_MODEL_CONTRAST = 4.0
-# A pixel that differs by more than this in a channel shows something else, grey levels; the means
-# of 3 x 3 pixels of the raster do not differ by that much from noise.
+# Difference in a channel above which a pixel has changed, grey levels; noise in means of 3 x 3
+# pixels of the raster is smaller.
 CHANGED_LEVELS = 24
 
 
 class Motion(NamedTuple):
-    """What has moved since the image that was learned last.
+    """Changes since the image that was learned last.
 
     Attributes:
-        moved: whether the person has, where the model was, and the rest of the image has not.
-        still: whether nothing has: whoever was there still is.
+        moved: whether the pixels of the model have changed, and the rest of the image has not.
+        still: whether nothing has changed, so that the person is still there.
     """
 
     moved: bool
@@ -71,8 +71,8 @@ class Colours:
 
     Attributes:
         size: (width, height) of the model, px of the raster.
-        here, elsewhere: usual means of p(M | colour) over a box at the person and beside; NaN:
-            unknown.
+        here, elsewhere: usual means of p(M | colour) over a box at the person and over one beside;
+            NaN if unknown.
     """
 
     def __init__(self) -> None:
@@ -85,7 +85,7 @@ class Colours:
         self._model = self._beyond = np.empty((0, 0), np.bool_)
 
     def score(self, image: Image, *, unseen: float = 0.0) -> float | None:
-        """Score of the person's colours in an image (h, w, 3) BGR; None: undecided.
+        """Score of the person's colours in an image (h, w, 3) BGR; None if undecided.
 
         Args:
             image: on the raster.
@@ -109,7 +109,7 @@ class Colours:
         return max(1.0 - share / LARGEST_CHANGE, 0.0)
 
     def motion(self, image: Image) -> Motion:
-        """What has moved since the image that was learned last."""
+        """Changes from the image that was learned last to an image (h, w, 3)."""
         model, other = counted(self._model), counted(self._beyond)
         if self._image is None or not model or image[self._model].std() < MIN_MODEL_CONTRAST:
             return Motion(moved=False, still=False)
@@ -127,7 +127,7 @@ class Colours:
         return np.asarray(cv2.inRange(change, (0, 0, 0), (CHANGED_LEVELS,) * 3) == 0)
 
     def learn(self, image: Image, model: Mask, dt: float) -> None:
-        """Takes in an image (h, w, 3) with the person on the pixels (h, w) of the model.
+        """Learns from an image (h, w, 3) with the person on the pixels (h, w) of the model.
 
         Args:
             image, model: on the raster.
@@ -165,7 +165,7 @@ class Colours:
     def _means(self, bins: NDArray[np.uint16], unseen: float = 0.0) -> NDArray[np.float32]:
         """Mean of p(M | colour) over a box at each pixel (h, w); beyond the image it is 0."""
         assert self._inside is not None
-        # A colour of less than a pixel is nobody's.
+        # A colour of less than a pixel belongs to neither.
         whole = self._inside + self._around + 1.0 / bins.size
         ratio = (self._inside / whole).astype(np.float32)
         if unseen:

@@ -15,10 +15,10 @@ from hmt_ros.image.background import BackgroundSettings, of_one_person, pieces_o
 from hmt_ros.image.surface_points import coarse_mesh
 from hmt_ros.inference.arrays import Array, Mask
 
-# Height of the raster that areas and colours are taken at, px.
+# Approximate height of the raster for areas and colours, px.
 RASTER = 240
-# A person's silhouette is this long at least, px, and neither a line nor a rectangle: bounds of its
-# area as a fraction of the square of its length, and of its bounding box.
+# Minimum length of a person's silhouette, px; minimum area as a fraction of the square of its
+# length (it is no line), and maximum area as a fraction of its bounding box (it is no rectangle).
 LEAST_LENGTH = 40
 LEAST_FILLED, MOST_FILLED = 0.04, 0.9
 
@@ -36,7 +36,7 @@ class Piece(NamedTuple):
 
 
 def raster_step(height: int) -> int:
-    """How many pixels of an image of this height lie between two of the raster."""
+    """Step of the raster in pixels of an image of this height."""
     return max(round(height / RASTER), 1)
 
 
@@ -48,14 +48,14 @@ def on_raster(image: NDArray[Any], raster: Mask) -> NDArray[Any]:
 
 
 def largest_person(foreground: Mask, step: int = 1) -> Piece | None:
-    """The largest piece of a foreground that has the shape of one person; None: there is none.
+    """The largest piece of a foreground that has the shape of one person; None if there is none.
 
     A piece is connected, or it is the largest one with the pieces near it: clothes in the colours
-    of the room leave holes.
+    of the room leave gaps.
 
     Args:
         foreground: (h, w).
-        step: px of the image between two of its pixels.
+        step: step of its pixels in the image, px.
     """
     x, y, across, down = cv2.boundingRect(foreground.view(np.uint8))
     if across == 0:
@@ -111,7 +111,7 @@ def fill_hull(mask: NDArray[np.uint8], pixels: Array) -> None:
 
 
 def _corners(mask: NDArray[np.uint8], pixels: Array) -> NDArray[np.int32]:
-    """Points (..., 2) as OpenCV takes them; far outside of the image they are cut, not wrapped."""
+    """Integer points (..., 2) for OpenCV, clipped far outside the image so that none overflows."""
     limit = 4.0 * max(mask.shape)
     return np.rint(np.clip(pixels, -limit, limit)).astype(np.int32)
 
@@ -122,7 +122,7 @@ def counted(mask: Mask) -> int:
 
 
 def resized(area: Mask, margin: float) -> Mask:
-    """An area (H, W) with a margin, as a fraction of its height; negative: without it."""
+    """An area (H, W) grown by a margin, a fraction of its height; shrunk if that is negative."""
     pixels = area.view(np.uint8)
     size = max(round(abs(margin) * cv2.boundingRect(pixels)[3]), 1)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))

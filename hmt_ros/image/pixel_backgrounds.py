@@ -25,7 +25,7 @@ class Background(Protocol):
     `BackgroundSettings`. The same images give the same labels.
 
     Attributes:
-        repeats: how often one image has to be learned to be all that is known.
+        repeats: number of times that an image is learned when it is the only one.
         empty: (h, w, 3) the empty scene, as far as it is known.
     """
 
@@ -37,15 +37,15 @@ class Background(Protocol):
         ...
 
     def learn(self, image: Image, share: float) -> None:
-        """Takes an image (h, w, 3) of the scene into the model.
+        """Adds an image (h, w, 3) of the scene to the model.
 
         Args:
-            share: weight of the image beside those before it, above 0; 1 for the first.
+            share: weight of the image relative to all images so far, above 0; 1 for the first.
         """
         ...
 
     def labels(self, image: Image) -> Image:
-        """`FOREGROUND`, `SHADOW` or 0 (h, w) of an image (h, w, 3); the model does not change."""
+        """Labels (h, w), `FOREGROUND`, `SHADOW` or 0, of an image; the model does not change."""
         ...
 
 
@@ -53,7 +53,7 @@ class OpenCvBackground:
     """A background of OpenCV; see `Background`.
 
     Args:
-        model: that has seen no image.
+        model: a model that has seen no image.
         frozen: learning rate at which the model does not change.
         repeats: see `Background`.
         shadow_threshold: as in `BackgroundSettings`.
@@ -92,7 +92,7 @@ def mixture_background(threshold: float, shadow_threshold: float) -> Background:
 
 
 def neighbour_background(threshold: float, shadow_threshold: float) -> Background:
-    """The nearest of some samples of each pixel: KNN."""
+    """The nearest neighbours among samples of each pixel: KNN."""
     model = cv2.createBackgroundSubtractorKNN(dist2Threshold=20.0 * threshold)
     # At a learning rate of 0 it would replace its samples at once.
     return OpenCvBackground(model, 1e-7, 20, shadow_threshold)

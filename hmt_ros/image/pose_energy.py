@@ -3,9 +3,9 @@
     E(x) = E_image(x) + E_keypoints(x) + E_prior(x) + E_intersection(x) + E_ground(x) + E_flow(x)
            + E_motion(x)
 
-A pose is placed once, and all terms in `core/terms` that it is compared by read its frames. The
-minima are those of `inference.bounded_newton`, problem by problem instead of step by step. A term
-that is not in the core is added by its own `energy`; then the minima are found step by step, too.
+The frames of a pose are computed once, and all terms in `core/terms` read them. The minima are
+those of `inference.bounded_newton`, found problem by problem instead of step by step. A term that
+is not in the core is added by its own `energy`; the minima are then found step by step, too.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ CompiledTerm = (
     | FlowTerm
 )
 
-# Length of a moderate step of an angle, rad, and of a place, m.
+# Length of a moderate step of an angle, rad, and of a position, m.
 ROTATION_STEP, PLACE_STEP = 0.4, 0.3
-# First damping of a minimisation, and gain by a step below which a minimum is found, nats.
+# Initial damping of a minimisation, and decrease in a step below which it ends, nats.
 DAMPING, TOLERANCE = 1.0, 1e-3
-# Maximum number of steps of a minimisation that is not limited otherwise.
+# Default maximum number of steps of a minimisation.
 MAX_ITERATIONS = 40
 
 
@@ -63,16 +63,16 @@ def scale_of(body: Body) -> Array:
 
 
 class Compiled(NamedTuple):
-    """The terms as compiled code reads them; a term that is not there counts 0.
+    """The terms as compiled code reads them; an absent term contributes 0.
 
     Attributes:
-        placing: of the skeleton.
-        model, inputs: of the terms of the image.
-        image, contour: whether one of these is on, and whether one that is on needs the contour.
-        keypoints, prior, overlaps, ground, flow: of the other terms.
-        centres, precisions: (R, f), (R, f, f) of the motion, a row a problem or one for all;
-            (0, f), (0, f, f) without a motion.
-        tails: its degrees of freedom; 0: it is Gaussian.
+        placing: constants of the skeleton.
+        model, inputs: inputs of the terms of the image.
+        image, contour: whether any of these is on, and whether any that is on needs the contour.
+        keypoints, prior, overlaps, ground, flow: inputs of the other terms.
+        centres, precisions: (R, f), (R, f, f) of the motion prior, one row per problem or one for
+            all; (0, f), (0, f, f) without a motion prior.
+        tails: degrees of freedom of the motion prior; 0 if it is Gaussian.
     """
 
     placing: Placing
@@ -94,8 +94,8 @@ class Descent(NamedTuple):
     """Settings of the minimiser; see `bounded_newton.minimise`.
 
     Attributes:
-        most: evaluations per problem after the first one.
-        damping, tolerance: first lambda, and gain of a step that ends a descent.
+        most: maximum number of evaluations per problem after the first one.
+        damping, tolerance: initial lambda, and decrease in a step below which a descent ends.
         scale: (d,) length of a moderate step of each variable.
     """
 
@@ -116,7 +116,7 @@ class ByCue:
     Attributes:
         energy: sum of all.
         values: (n, 3).
-        hessians: (n, 3, d, d); of no pose: not asked for.
+        hessians: (n, 3, d, d); (0, 3, d, d) if they were not requested.
         outline_costs: (n, M) energy of each sample of the silhouette's outline.
     """
 
@@ -128,20 +128,20 @@ class ByCue:
 
 @dataclass(frozen=True, eq=False)
 class PoseEnergy:
-    """A sum of terms over the poses of a body; an `EnergyTerm` over all variables, or some.
+    """A sum of terms over the poses of a body; an `EnergyTerm` over all variables or some of them.
 
     Attributes:
-        likelihood: of the body before the camera.
-        terms: that read the frames of a pose, at most one of each kind that has a kernel.
-        motion: around where poses are expected, over the free variables; None: nothing is expected.
+        likelihood: image likelihood of the body.
+        terms: terms that read the frames of a pose, at most one of each kind that has a kernel.
+        motion: prior around the expected poses, over the free variables; None if there is none.
         point: (d,) values of all variables; None: all are free.
-        free: (f,) variables that may move, where there is a point.
+        free: (f,) indices of the variables that may move, if `point` is given.
         counted: called with the number of poses that were evaluated; None: not called.
-        _own: terms with a kernel here, without the motion.
-        _strange: terms without one.
+        _own: terms with a compiled kernel, without the motion prior.
+        _strange: terms without a compiled kernel.
 
     Raises:
-        ValueError: two terms of one kind that has a kernel.
+        ValueError: two terms are of one kind that has a kernel.
     """
 
     likelihood: ImageLikelihood
@@ -171,19 +171,19 @@ class PoseEnergy:
         Without rows, point i belongs to problem i.
 
         Raises:
-            ValueError: x has not f columns, or is not finite.
+            ValueError: x does not have f columns, or is not finite.
         """
         return self._evaluated(x, rows, derivatives, apart=False)[0]
 
     def values(self, x: Array) -> Array:
-        """The energies (n,) alone; pose i belongs to problem i. See `energy`."""
+        """The energies (n,) without derivatives; pose i belongs to problem i. See `energy`."""
         return self.energy(x, derivatives=Derivatives.NONE).value
 
     def by_cue(self, x: Array, *, derivatives: bool = True) -> ByCue:
         """The energy at poses x (n, d), cue by cue; pose i belongs to problem i.
 
         Raises:
-            ValueError: some variables are fixed, there is a motion, or x is not as for `energy`.
+            ValueError: some variables are fixed, there is a motion prior, or `energy` would fail.
         """
         if self.point is not None or self.motion is not None:
             seen = 'a motion' if self.point is None else 'variables that are fixed'
@@ -229,7 +229,7 @@ class PoseEnergy:
             damping, max_iterations, tolerance: as for `bounded_newton.minimise`.
 
         Raises:
-            ValueError: x has not f columns, or is not finite.
+            ValueError: x does not have f columns, or is not finite.
         """
         body = self.likelihood.body
         step_scale = scale_of(body) if step_scale is None else step_scale
@@ -267,14 +267,14 @@ class PoseEnergy:
     ) -> tuple[
         Energy, tuple[Array, Array, Array], NDArray[np.int8], NDArray[np.int32], NDArray[np.bool_]
     ]:
-        """Energies of points x (n, f), or minima that they become; results as for `solve`.
+        """Energies at points x (n, f), or minima that x is moved to; results as for `solve`.
 
         Args:
-            rows: (n,) the problem of each; None: its own.
-            descent: towards a minimum; `NO_DESCENT`: the points stay.
+            rows: (n,) problem of each point; None: point i belongs to problem i.
+            descent: settings of the minimiser; with `NO_DESCENT` the points stay.
             together: number of points that a thread takes at once.
             wanted: whether derivatives are wanted.
-            apart: whether values and Hessians by cue, and costs of the outline are.
+            apart: whether values and Hessians by cue, and costs of the outline, are wanted.
         """
         n, f = x.shape
         asked, values = n if wanted else 0, n if apart else 0
@@ -329,7 +329,7 @@ class PoseEnergy:
 
     @cached_property
     def _compiled(self) -> Compiled:
-        """The terms as compiled code reads them; they return their energies alone."""
+        """The terms as compiled code reads them, without room for costs of the outline."""
         known = self._own
         if self.motion is not None:
             centres, precisions, tails = _expected(self.motion)
@@ -340,13 +340,13 @@ class PoseEnergy:
         return known._replace(centres=np.zeros((0, f)), precisions=np.zeros((0, f, f)))
 
 
-# An image is compared with many sets of poses.
+# Cached because an image is compared with many sets of poses.
 @lru_cache(maxsize=8)
 def _summed(likelihood: ImageLikelihood, terms: tuple[CompiledTerm | FrameTerm, ...]) -> Compiled:
-    """Terms with a kernel here, as compiled code reads them.
+    """Terms with a compiled kernel, as compiled code reads them.
 
     Raises:
-        ValueError: two terms of one kind.
+        ValueError: two terms are of one kind.
     """
     known: dict[str, Any] = {}
     for term in terms:
@@ -371,7 +371,7 @@ def _with_costs(compiled: Compiled, poses: int) -> tuple[Compiled, Array]:
 
 
 def _expected(motion: Quadratic | Student) -> tuple[Array, Array, float]:
-    """Centres, precisions and degrees of freedom of a motion."""
+    """Centres, precisions and degrees of freedom of a motion prior."""
     centres, precisions = np.atleast_2d(motion.centres), motion.precisions
     if precisions.ndim == 1:
         precisions = np.diag(precisions)
@@ -389,7 +389,7 @@ def _expected(motion: Quadratic | Student) -> tuple[Array, Array, float]:
     )
 
 
-# Names in `Compiled` of the inputs of terms with a kernel here.
+# Field of `Compiled` that holds the inputs of each kind of term with a compiled kernel.
 KINDS: dict[type, str] = {
     ObservedImage: 'image',
     KeypointTerm: 'keypoints',
@@ -415,7 +415,7 @@ def _every_variable(body: Body) -> Index:
 
 @lru_cache(maxsize=16)
 def _absent(body: Body) -> Compiled:
-    """What compiled code reads where no term is there."""
+    """Inputs of compiled code without any term."""
     camera = Camera(1.0, 1.0, 0.0, 0.0, 1, 1)
     none, nothing = np.zeros(0, np.int64), np.zeros((0, 0, 3))
     no_keypoints = Keypoints((), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))

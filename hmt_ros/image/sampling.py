@@ -1,4 +1,4 @@
-"""Image maps, of which `core/sampling.h` takes bilinear values and gradients."""
+"""Image maps, which `core/sampling.h` samples for bilinear values and gradients."""
 
 from __future__ import annotations
 

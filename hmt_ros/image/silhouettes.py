@@ -1,15 +1,14 @@
 """Source of the silhouette of an image, and whether the background is to be trusted.
 
-A mask of a segmenter is taken as it is, else the background is subtracted, once the scene is known
-to be empty (`EmptyScene`). When a track starts from joints, the pose is known, and
+The mask of a segmenter is used if there is one; otherwise the background is subtracted, once the
+scene is known to be empty (`EmptyScene`). When a track starts from joints, the pose is known, and
 
     f = |foreground and area of the body| / |area of the body|
 
-is near 1 before an empty scene, and less in clothes of the colours of the room. Below
-`MIN_FOREGROUND_FRACTION` a background that was learned is forgotten and put together anew, pixel by
-pixel, from the images that follow: where no mode of the posterior has the person, as far as
-something else than silhouettes says where that is. Until it is known around the person, images are
-tracked without silhouettes.
+is near 1 in front of an empty scene, and less in clothes of the colours of the room. Below
+`MIN_FOREGROUND_FRACTION` a learned background is forgotten and rebuilt, pixel by pixel, from later
+images: where no mode of the posterior has the person, as far as other cues than silhouettes locate
+the person. Until it is known around the person, images are tracked without silhouettes.
 """
 
 from __future__ import annotations
@@ -30,16 +29,16 @@ from hmt_ros.inference.arrays import Array, Image, Mask
 
 # Shift of the still scene, px, above which a background belongs to another view.
 VIEW_SHIFT = 2.0
-# Minimum fraction of the person that is foreground before a background without the person.
+# Minimum foreground fraction of the person for the background to count as empty.
 MIN_FOREGROUND_FRACTION = 0.35
-# Log odds of somebody in a scene that was put together where nobody was, nats.
+# Log odds that somebody is in a scene that was rebuilt where nobody was, nats.
 COMPLETED_LOG_ODDS = -6.0
-# Margins of the area of a body, as a fraction of its height: for the sure area of the person, and
-# for the possible one.
+# Margins of the area of a body, as a fraction of its height: inwards for the certain area of the
+# person, outwards for the possible one.
 INNER_MARGIN, OUTER_MARGIN = 0.01, 0.06
-# Largest share of the person's area that may be unknown where silhouettes are used.
+# Maximum unknown fraction of the person's area for silhouettes to be used.
 MAX_UNKNOWN_FRACTION = 0.02
-# Margin around all joints of all modes, as a fraction of their extent: where the silhouette may be.
+# Margin around all joints of all modes that a silhouette may reach, as a fraction of their extent.
 REGION_MARGIN = 0.3
 
 
@@ -52,8 +51,8 @@ class Silhouettes:
 
     Attributes:
         scene: the empty scene, as far as it is known.
-        watch: tells whether the camera has moved since the background was taken.
-        doubted: whether the background was learned with the person in it, and is not known again.
+        watch: detects whether the camera has moved since the background was taken.
+        doubted: whether the background was learned with the person in it, and is not yet rebuilt.
     """
 
     def __init__(self, background: BackgroundModel, *, shared: bool = False) -> None:
@@ -80,13 +79,13 @@ class Silhouettes:
         return 'not yet seen empty' if self.background.frames else 'unknown'
 
     def forget(self) -> None:
-        """Begins anew without a background: the camera sees another scene."""
+        """Starts again without a background, because the camera sees another scene."""
         self.scene = EmptyScene(BackgroundModel(self.background.settings), trusted=self._shared)
         self.doubted, self._learning = False, not self._shared
         self.watch = SceneWatch()
 
     def see_from(self, pose: CameraPose, camera: Camera) -> None:
-        """Takes the pose of the camera at an image; from another view the scene is another."""
+        """Sets the pose of the camera at an image; another view forgets the background."""
         if self._seen_from is None:
             self._seen_from = pose
         elif pose.shift(self._seen_from, camera) > VIEW_SHIFT:
@@ -108,14 +107,14 @@ class Silhouettes:
         region: Box | None,
         others: Mask | None = None,
     ) -> Silhouette | None:
-        """The silhouette in an image; None: unknown.
+        """The silhouette in an image; None if unknown.
 
         Args:
             image: (H, W, 3).
             stamp: of the image, ns.
             mask: (H, W) of a segmenter, if any.
             region: where the person can be; None: anywhere.
-            others: (H, W) pixels that somebody else covers; None: none.
+            others: (H, W) pixels that somebody else covers; None if there are none.
         """
         if mask is not None:
             mask = mask if others is None else mask & ~others
@@ -134,7 +133,7 @@ class Silhouettes:
         """All foreground of an image, at every step-th pixel (H / step, W / step).
 
         Args:
-            image, mask, others: as for `silhouette`, which is not None.
+            image, mask, others: as for `silhouette`, whose result must not be None.
             step: px.
         """
         found = self.background.foreground(image) if mask is None else mask
@@ -148,7 +147,7 @@ class Silhouettes:
     def check(self, image: Image, body: Body, camera: Camera, poses: Array) -> None:
         """Doubts the background if too little of the person, in poses (K, d), is foreground.
 
-        A background that was given, not learned, is the empty scene: then nobody is there.
+        A background that was given, not learned, is the empty scene and never doubted.
         """
         if not self.background.frames or not self._learning:
             return
@@ -164,7 +163,7 @@ class Silhouettes:
         self.background.forget()
 
     def complete(self, image: Image, body: Body, camera: Camera, poses: Array) -> None:
-        """Puts a forgotten background together, where the person in poses (K, d) is not."""
+        """Rebuilds a forgotten background where the person in poses (K, d) is not."""
         if self.background.unknown is None:
             return
         area = _area(body, camera, poses)
@@ -181,11 +180,11 @@ class Silhouettes:
 def region_of(
     body: Body, camera: Camera, poses: Array, margin: float = REGION_MARGIN, dt: float = 0.0
 ) -> Box | None:
-    """Where a person in poses (K, d) can be in the next image; None: anywhere.
+    """Where a person in poses (K, d) can be in the next image; None if anywhere.
 
     Args:
         body, camera, poses: of the person.
-        margin: around all joints, as a fraction of their extent.
+        margin: margin around all joints, as a fraction of their extent.
         dt: time since the person was at the poses, s.
     """
     pixels = camera.project(body.joint_positions(poses)).reshape(-1, 2)
@@ -205,5 +204,5 @@ def region_of(
 
 
 def _area(body: Body, camera: Camera, poses: Array) -> Mask:
-    """Where some of the poses (K, d) have the body, (H, W)."""
+    """Pixels (H, W) that the body covers in any of the poses (K, d)."""
     return np.asarray(render_silhouettes(body, poses, camera).any(0), dtype=np.bool_)

@@ -1,6 +1,6 @@
-"""Whether an image shows the same picture as another one around keypoints.
+"""Whether two images show the same picture around keypoints.
 
-A detector that takes the foot of a table for a person does so in every image that shows the same.
+A detector that takes the foot of a table for a person does so in every image of the same scene.
 People move, if only a little.
 """
 
@@ -13,24 +13,24 @@ from numpy.typing import NDArray
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Image
 
-# Blur of images that are compared, px; least change of a pixel that noise does not make, grey
-# levels; share of the pixels around keypoints that change when a person breathes or sways within
-# tenths of a second (0.003 and more on ten clips of people, 0 on a table); least contrast.
+# Blur of compared images, px; minimum change of a pixel that is not noise, grey levels; minimum
+# fraction of the pixels around keypoints that change when a person breathes or sways within tenths
+# of a second (0.003 and more on ten clips of people, 0 on a table); minimum contrast, grey levels.
 BLUR, CHANGED, MOVING, CONTRAST = 1.5, 10.0, 0.002, 4.0
 
 
 class StillPicture:
-    """The last image that showed something else around keypoints than the one before."""
+    """The last image that differed around keypoints from the image kept before it."""
 
     def __init__(self) -> None:
         self._last: NDArray[np.float32] | None = None
 
     def shows_again(self, image: Image, keypoints: Keypoints) -> bool:
-        """Whether keypoints lie on the last such picture; else the image becomes the last.
+        """Whether an image equals the kept one around keypoints; if not, it is kept instead.
 
         Args:
             image: (H, W, 3) BGR.
-            keypoints: some of which were seen.
+            keypoints: keypoints, at least one of which was seen.
         """
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         picture = cv2.GaussianBlur(grey, (0, 0), BLUR).astype(np.float32)

@@ -19,7 +19,7 @@ KEYS = ('stamp_ns', 'sigma_px', 'keypoints', 'segment_lengths_m', 'stature_m')
 
 
 class SubjectError(ValueError):
-    """A subject file that can not be used; one line with the content seen and wanted."""
+    """A subject file cannot be used; the message, one line, gives the content seen and wanted."""
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class Subject:
     """The content of a subject file, from which a track starts.
 
     Attributes:
-        stamp_ns: of the image in which the joints were seen.
+        stamp_ns: stamp of the image in which the joints were seen.
         keypoints: the joints.
-        segment_lengths: m, where measured.
-        stature: m, or None.
+        segment_lengths: measured lengths by name, m.
+        stature: stature, m; None if unknown.
     """
 
     stamp_ns: int
@@ -46,8 +46,8 @@ def read_subject(path: str | Path, body: Body) -> Subject:
     `segment_lengths_m` (name: length) and `stature_m`.
 
     Raises:
-        SubjectError: a file that is missing, is not YAML, lacks an entry, or names a joint or a
-            length that the body does not have.
+        SubjectError: the file is missing, is not YAML, lacks an entry, or names a joint or a length
+            that the body does not have.
     """
     try:
         return parse_subject(read_plain_yaml(path, LARGEST_FILE), body)

@@ -24,8 +24,8 @@ Ints = NDArray[np.int64]
 class FleshTable(NamedTuple):
     """The flesh as the compiled code reads it: parts (B,), and rings (R,) of `flesh.Rings`.
 
-    `ring_noise` (R, 2) tells how far contours of people lie from the model's, standard deviations
-    at the sides and in front and behind, m; see `contour_noise.yaml`.
+    `ring_noise` (R, 2) are standard deviations of contours of people from the model's, at the
+    sides and in front or behind, m; see `contour_noise.yaml`.
     """
 
     part_segments: Ints
@@ -49,10 +49,10 @@ class Contour(NamedTuple):
         pixels: (P, 2).
         projections: (P, 2, 3) derivative of the pixels with respect to the points.
         normals: (P, 2) out of the body, in the image.
-        valid: (P,) the point exists and lies before the camera.
-        covered: (P,) another part lies on the same ray, before or behind.
-        hidden: (P,) another part lies on the same ray, before.
-        noise: (P,) how far contours of people lie from the point, a standard deviation, m.
+        valid: (P,) the point exists and lies in front of the camera.
+        covered: (P,) another part lies on the same ray, in front or behind.
+        hidden: (P,) another part lies on the same ray, in front.
+        noise: (P,) standard deviation of contours of people from the point, m.
     """
 
     parts: Ints
@@ -68,7 +68,7 @@ class Contour(NamedTuple):
 
 @lru_cache(maxsize=16)
 def flesh_table_of(body: Body) -> FleshTable:
-    """The compiled code's view of a body's flesh."""
+    """The flesh of a body as the compiled code reads it."""
     flesh, ring = body.flesh, body.flesh.rings
     return FleshTable(
         np.array([p.segment for p in flesh.parts], dtype=np.int64),
@@ -99,7 +99,7 @@ def _contour_noise(body: Body) -> Array:
 
 
 def empty_contour(rings: int) -> Contour:
-    """Room for the contour of one pose."""
+    """A contour with room for one pose."""
     count = 2 * rings
     valid, covered, hidden = np.zeros((3, count), np.bool_)
     return Contour(

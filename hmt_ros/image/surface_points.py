@@ -22,9 +22,9 @@ class SurfacePoints(NamedTuple):
     """Up to Q points on the visible surface of each of K poses.
 
     Attributes:
-        counts: (K,) points of each pose; the rest of its row is not used.
-        segments: (K, Q).
-        local: (K, Q, 3) places in the frames of the segments, m.
+        counts: (K,) number of points of each pose; the rest of its row is not used.
+        segments: (K, Q) segments that the points lie on.
+        local: (K, Q, 3) positions in the frames of the segments, m.
         pixels: (K, Q, 2) where they are seen.
     """
 
@@ -43,10 +43,10 @@ def seen_points(
 
     Args:
         body: with flesh.
-        camera: that sees it.
-        frames: of the K poses.
-        others: (H, W) pixels that show or may show somebody else; None: there are none.
-        points: at most so many a pose, Q.
+        camera: camera that sees it.
+        frames: frames of the K poses.
+        others: (H, W) pixels that show or may show somebody else; None if there are none.
+        points: maximum number Q of points per pose.
     """
     k = frames.count
     mesh = coarse_mesh(body)
@@ -68,5 +68,5 @@ def seen_points(
 
 
 def coarse_mesh(body: Body) -> Mesh:
-    """The mesh whose vertices are such points."""
+    """The coarse mesh whose vertices are candidate points."""
     return body.flesh.mesh(stacks=5, slices=10)

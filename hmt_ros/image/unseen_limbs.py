@@ -1,11 +1,11 @@
-"""Which limbs an image shows, and for how long none has shown the others.
+"""Which limbs an image shows, and how long ago the others were last shown.
 
-A limb is shown as far out as a keypoint or the silhouette finds its joints. Without keypoints, and
-in the image, edges and flow may show it.
+A limb is shown as far out as keypoints find its joints in the image. Without keypoints it is shown
+wherever it lies in the image, because silhouette, edges and flow may show it.
 
-A leg is hidden, by furniture or by the border of the image, where a detector is sure of none of its
-joints beyond the hip. What the detector says of it is a guess from what legs usually do, and that
-no silhouette is where the leg may be says nothing either. An arm that a detector is not sure of is
+A leg is hidden, by furniture or by the border of the image, if a detector is sure of none of its
+joints beyond the hip. The detector then guesses from usual poses of legs, and a missing silhouette
+of the leg is no evidence either. An arm that a detector is not sure of is
 mostly behind its own trunk, where guesses are good.
 """
 
@@ -27,22 +27,22 @@ from hmt_ros.inference.error_model import seconds
 
 # Confidence below which a keypoint is a guess.
 GUESSED = 0.02
-# Confidence from which a detector sees a keypoint more likely than not.
+# Confidence above which a detector more likely than not sees a keypoint.
 SEEN = 0.5
-# Time for which it still matters where an unseen limb may be, s.
+# Time for which a limb counts as shown, or as hidden, after the last image with this evidence, s.
 SHORT = 1.0
-# Error of an unseen joint for each bone of its limb, as a share of its length: by the lengths
-# of people, and by what a linear map misses within a posture.
+# Error of an unseen joint for each bone of its limb, as a fraction of the bone's length: lengths of
+# people vary, and a linear map is inexact within a posture.
 ALONG_LIMB = 0.08
 
 
 class UnseenLimbs:
-    """For how long no image has shown the segments of a person's limbs.
+    """Times since an image last showed the segments of a person's limbs.
 
     Attributes:
-        times: (S,) s; 0: the last image shows the joint at its start, or one further out, or it is
-            no segment of a limb; inf: no image has.
-        hidden: (S,) that something hides from the detector; None: nothing does.
+        times: (S,) s; 0 if the last image shows the joint at the start of the segment or one
+            further out, or if the segment is not in a limb; inf if no image has shown it.
+        hidden: (S,) segments that something hides from the detector; None if nothing does.
     """
 
     def __init__(self, body: Body) -> None:
@@ -53,12 +53,12 @@ class UnseenLimbs:
     def without_guesses(
         self, body: Body, keypoints: Keypoints | None, stamp: int
     ) -> Keypoints | None:
-        """Keypoints of which those of hidden segments have no confidence.
+        """Keypoints with confidence 0 on hidden segments.
 
         Args:
-            body: of the person.
-            keypoints: of an image; None: the detector has not answered. What it hid a short time
-                ago is still hidden.
+            body: body of the person.
+            keypoints: keypoints of an image; None if the detector has not answered: segments that
+                were hidden within `SHORT` then stay hidden.
             stamp: of the image, ns.
         """
         if keypoints is None:
@@ -77,16 +77,16 @@ class UnseenLimbs:
     def look(
         self, body: Body, camera: Camera, observation: Observation, pose: Array, dt: float
     ) -> None:
-        """Takes in an image and the likeliest pose (d,) in it.
+        """Updates the times by an image and the likeliest pose (d,) in it.
 
         Args:
-            dt: time since the image before, s; inf: there is none.
+            dt: time since the image before, s; inf if there is none.
         """
         shown = shown_segments(body, camera, observation, pose)
         self.times = np.where(shown, 0.0, self.times + dt)
 
     def of_dofs(self, body: Body) -> Array:
-        """Time (d,) since the degrees of freedom were shown: the joint beyond tells of them."""
+        """Time (d,) since each degree of freedom was shown, by the joint beyond it, s."""
         beyond = np.arange(len(self.times))
         for chain in body.chains.values():
             beyond[list(chain[:-1])] = chain[1:]
@@ -95,11 +95,11 @@ class UnseenLimbs:
         return times[body.skeleton.dof_segments]
 
     def shown_joints(self, body: Body) -> Mask:
-        """Joints (J,) that an image has shown a short time ago."""
+        """Joints (J,) that an image has shown within `SHORT`."""
         return np.asarray(self.times[body.skeleton.joint_segments] < SHORT)
 
     def told(self, body: Body) -> Body:
-        """The body, whose unseen joints err more: bones may be longer, and joints move on arcs."""
+        """The body with larger errors of unseen joints, whose bones vary and which move on arcs."""
         hidden = self.times > 0.0
         return _told(body, tuple(hidden.tolist())) if hidden.any() else body
 
@@ -143,7 +143,7 @@ def shown_segments(body: Body, camera: Camera, observation: Observation, pose: A
 
 @lru_cache(maxsize=16)
 def _showing(skeleton: Skeleton) -> Mask:
-    """Segments (S, S) that show another one, each a row; none shows what always counts as shown."""
+    """Segments (S, S) that show the segment of each row; without any it always counts as shown."""
     result = np.zeros((len(skeleton.parents),) * 2, dtype=np.bool_)
     for chain in (chain for pair in sided_pairs(skeleton.chains) for chain in pair):
         outwards = list(skeleton.chains[chain])

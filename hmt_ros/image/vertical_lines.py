@@ -1,16 +1,15 @@
 """The vertical from the straight lines of a scene (Coughlan and Yuille, ICCV 1999).
 
 Edges of walls, doors and furniture run along the vertical or along two horizontal directions at
-right angles to each other. With an angle e_ik between line i in the image and the direction k of
-such a frame R, as the image would show it at the place of the line,
+right angles to each other. With the angle e_ik in the image between line i and the direction k of
+such a frame R, projected at the place of the line,
 
     log p(lines | R) = sum_i log[1 - s + s / 3 sum_k r(e_ik)],   r(e) = N(e; 0, sigma) / uniform,
 
-the share s of all lines follows the frame and the rest is clutter. Summed over a raster of frames
-with a prior over how cameras are mounted, this gives the probability that there is such a frame at
-all, and the direction of its vertical. Furniture stands in all horizontal directions:
-the vertical is then refined by the lines that agree with it alone, from a wide sigma to a narrow
-one.
+where a share s of all lines follows the frame and the rest is clutter. Summed over a raster of
+frames with a prior over how cameras are mounted, this gives the probability that there is such a
+frame at all, and the direction of its vertical. Furniture has any horizontal direction, so only the
+lines that agree with the vertical refine it, from a wide sigma to a narrow one.
 """
 
 from __future__ import annotations
@@ -30,28 +29,28 @@ from hmt_ros.inference.logistic import probability_of
 
 # The level of an upright camera.
 UPRIGHT = np.eye(3)
-# Images are made this large at most, px, and a line has this length at least, rad.
+# Maximum side of an image, px (larger ones are reduced), and minimum length of a line, rad.
 LARGEST, SHORTEST = 800, 0.03
-# Lines in planes through the camera that differ by less are one line, rad.
+# Angle between the planes of two lines through the camera below which they are one line, rad.
 SAME_LINE = np.radians(0.7)
-# Share of lines that follow the frame; error of an end of a line, px.
+# Share of lines that follow the frame; standard deviation of an end of a line, px.
 SHARE, END_SIGMA = 0.5, 0.5
-# How cameras are mounted, rad: pitch, down is positive, with its deviations upwards and downwards,
-# and roll; and their limits.
+# How cameras are mounted, rad: mean pitch, down is positive, and its deviations upwards and
+# downwards; limits of pitch; deviation of roll, and its limit.
 PITCH, PITCH_SIGMA = np.radians(5.0), (np.radians(12.0), np.radians(20.0))
 PITCHES = np.radians(-40.0), np.radians(72.0)
 ROLL, MOST_ROLL = np.radians(6.0), np.radians(32.0)
-# Steps of the raster of frames, and deviations of the angle of a line: on the raster, and then in
-# the refinement, rad.
+# Step of the raster of frames, and standard deviations of the angle of a line on the raster and in
+# each round of the refinement, rad.
 STEP, COARSE = np.radians(4.0), np.radians(2.5)
 FINER = tuple(np.radians([4.0, 3.0, 2.0, 1.0, 0.5, 0.5, 0.5]))
-# Deviation of the vertical of the best frame on the raster, and of the refined one where lines are
-# many: walls lean and lenses bend, rad.
+# Standard deviation of the vertical of the best frame on the raster, and minimum one after the
+# refinement, because walls lean and lenses bend lines, rad.
 RASTER_SIGMA, LEAST_SIGMA = np.radians(4.0), np.radians(1.0)
-# Share of looks whose vertical is right, and density of one that is not, 1/sr.
+# Probability that a seen vertical is right, and density of a wrong one, 1/sr.
 RIGHT, ANYWHERE = 0.9, 1.0 / (2.0 * np.pi)
-# Probability that there is a frame, and that its vertical is in the surroundings of the best one,
-# rad, above which that is believed.
+# Minimum probability that there is a frame whose vertical is near the best one, and radius of that
+# neighbourhood, rad.
 BELIEVED, SURROUNDINGS = 0.95, np.radians(10.0)
 
 
@@ -82,7 +81,7 @@ class Vertical:
     sigma: float
 
     def agreement(self, up: Array, sigma: float) -> float:
-        """Density of this vertical where another (3,) with a deviation is right, over any alone."""
+        """Density of this vertical if another one (3,) with a deviation is right, over uniform."""
         variance = sigma**2 + self.sigma**2
         square = 2.0 - 2.0 * float(product(up, self.up))
         near = elementary.exp(-0.5 * square / variance) / (2.0 * np.pi * variance)
@@ -91,7 +90,7 @@ class Vertical:
     def refined(self, up: Array, sigma: float) -> Vertical:
         """Another vertical, (3,) with a deviation, refined by this one as far as both agree.
 
-        It moves by its deviation at most.
+        It moves by at most its deviation.
         """
         right = 1.0 - (1.0 - RIGHT) / self.agreement(up, sigma)
         share = max(right, 0.0) * sigma**2 / (sigma**2 + self.sigma**2)
@@ -101,11 +100,11 @@ class Vertical:
 
 
 def seen_vertical(image: Image, camera: Camera, level: Array = UPRIGHT) -> Vertical | None:
-    """The vertical that an image (H, W) or (H, W, 3) shows; None: its lines show none.
+    """The vertical that an image (H, W) or (H, W, 3) shows; None if its lines show none.
 
     Args:
-        image: seen by the camera.
-        camera: that is mounted as most are, but for its level.
+        image: image of the camera.
+        camera: a camera that is mounted as usual, except for its level.
         level: (3, 3) rotation about the optical axis from an upright camera's axes to its own.
     """
     lines = straight_lines(image, camera)
@@ -117,7 +116,7 @@ def seen_vertical(image: Image, camera: Camera, level: Array = UPRIGHT) -> Verti
 
 
 def straight_lines(image: Image, camera: Camera) -> Lines:
-    """The straight lines of an image (H, W) or (H, W, 3), longest first, each once."""
+    """The straight lines of an image (H, W) or (H, W, 3), longest first, without duplicates."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     scale = min(LARGEST / max(grey.shape), 1.0)
     if scale < 1.0:
@@ -145,7 +144,7 @@ def straight_lines(image: Image, camera: Camera) -> Lines:
 
 
 def vertical_of(lines: Lines) -> Vertical | None:
-    """The vertical of lines; None: they are clutter, or fit several."""
+    """The vertical of lines; None if they are clutter or fit several verticals."""
     raster = _raster()
     ratios = _ratios(raster.directions, lines, COARSE)
     value = np.empty(raster.first.shape)
@@ -159,7 +158,7 @@ def vertical_of(lines: Lines) -> Vertical | None:
 
 
 def _refined(start: Array, lines: Lines) -> Vertical:
-    """The vertical by the lines that agree with it, near where the raster has it (3,)."""
+    """The vertical from the lines that agree with it, near a start (3,) from the raster."""
     up = start
     information = np.eye(3)
     for sigma in FINER:
@@ -180,7 +179,7 @@ def _refined(start: Array, lines: Lines) -> Vertical:
 
 
 def _ratios(directions: Array, lines: Lines, sigma: float) -> Array:
-    """Densities (D, N) of the angles of lines if they ran along directions (D, 3), over uniform."""
+    """Densities (D, N) of the angles of lines that run along directions (D, 3), over uniform."""
     deviations = np.sqrt(sigma**2 + lines.errors**2)
     result = np.empty((len(directions), len(deviations)))
     rate_lines(directions, lines.normals, lines.middles, deviations, result)

@@ -49,7 +49,7 @@ class BlockTridiagonal:
         lower: (T-1, n, n) E_t, the block below D_t.
 
     Raises:
-        ValueError: shapes that contradict each other.
+        ValueError: shapes are inconsistent.
     """
 
     diagonal: Array
@@ -100,8 +100,8 @@ class BlockCholesky:
     Attributes:
         columns: (T n, width + 1) of L in LAPACK's band storage: [j, i - j] = L[i, j].
         times, size: T and n.
-        last_first: whether L is of the blocks from the last to the first. Then blocks of the
-            inverse come from the first on.
+        last_first: whether the blocks are eliminated from the last to the first. Blocks of the
+            inverse are then computed from the first on.
     """
 
     columns: Array
@@ -163,7 +163,7 @@ class BlockCholesky:
 
     @cached_property
     def _inverse_blocks(self) -> list[Array]:
-        """Those that were asked for, backwards along L."""
+        """Compute the requested blocks, backwards along L."""
         return []
 
     def matrix(self) -> BlockTridiagonal:
@@ -202,7 +202,7 @@ class BlockCholesky:
 
 
 def bandwidth(lower: Array, n: int) -> int:
-    """Number of diagonals below the main one that blocks E_t (T-1, n, n) of coupling reach."""
+    """Return the number of diagonals below the main one, for coupling blocks E_t (T-1, n, n)."""
     row, column = np.nonzero((lower != 0).any(axis=0))
     return max(n - 1, n + int((row - column).max(initial=-n)))
 

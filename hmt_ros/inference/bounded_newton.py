@@ -5,12 +5,13 @@ quadratic model in the box,
 
     g.s + 1/2 s.(H + lambda W) s    subject to    lower - x <= s <= upper - x,
 
-by an active set: variables that the step drives across a limit are put on it, the others are solved
-again, and variables that are pulled away from their limit are set free. `TrustRegion` moves lambda.
-Each problem has its own lambda and its own active set, and leaves the batch when it has converged.
+by an active set: variables that the step drives across a limit are fixed at it, the others are
+solved again, and variables whose gradient points away from their limit are released. `TrustRegion`
+adapts lambda. Each problem has its own lambda and its own active set, and leaves the batch when it
+has converged.
 
-The damping shows how far the model is trusted: the fraction of the predicted decrease that comes
-true sets lambda for the next step [Nielsen, Damping parameter in Marquardt's method, 1999]:
+The damping expresses the trust in the model: the ratio of actual to predicted decrease sets lambda
+for the next step [Nielsen, Damping parameter in Marquardt's method, 1999]:
 
     rho = (E(x) - E(x + s)) / (m(0) - m(s))
 
@@ -33,12 +34,12 @@ from hmt_ros.inference.energy import EnergyTerm
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Result of `minimise`, one row a problem.
+    """Result of `minimise`, one row per problem.
 
     Attributes:
         x: (N, d) minimiser.
         value, gradient, hessian: (N,), (N, d), (N, d, d) of the energy there.
-        free: (N, d) variables that do not rest on a limit.
+        free: (N, d) whether a variable is not fixed at a limit.
         status: (N,) of `Status`.
         iterations: (N,) evaluations after the first.
     """
@@ -52,11 +53,11 @@ class Minimum:
     iterations: NDArray[np.int32]
 
     def __getitem__(self, rows: Index) -> Minimum:
-        """Some of them."""
+        """Select problems."""
         return Minimum(*(part[rows] for part in vars(self).values()))
 
     def joined(self, other: Minimum) -> Minimum:
-        """These and others."""
+        """Concatenate with other results."""
         parts = zip(vars(self).values(), vars(other).values(), strict=True)
         return Minimum(*(np.concatenate(pair) for pair in parts))
 
@@ -83,7 +84,8 @@ def minimise(
             W = diag(step_scale^-2).
         damping: first lambda, in units of energy.
         max_iterations: evaluations per problem after the first one.
-        tolerance: converged when a step is predicted to gain less than this, in units of energy.
+        tolerance: predicted decrease of a step below which a problem has converged, in units of
+            energy.
     """
     lower, upper = (np.asarray(limit, dtype=np.float64) for limit in (lower, upper))
     x = np.ascontiguousarray(np.clip(np.array(x, dtype=np.float64, ndmin=2), lower, upper))
@@ -116,7 +118,7 @@ def minimise(
             break
         start, low, high = x[active], lower[active], upper[active]
         trial = np.minimum(np.maximum(start + step, low), high)
-        # Rounding must not leave a variable a hair away from the limit it was put on.
+        # Rounding must not move a variable off the limit where it is fixed.
         trial = np.where(step <= low - start, low, trial)
         trial = np.where(step >= high - start, high, trial)
         found = term.energy(trial, active)
@@ -173,7 +175,7 @@ class TrustRegion:
         self._limit, self._least_factor, self._least_refused = limit, least_factor, least_refused
 
     def accept(self, rows: Index, decrease: Array, predicted: Array) -> NDArray[np.bool_]:
-        """Mask (n,) of the steps that are to be taken; their dampings follow.
+        """Return the mask (n,) of accepted steps, and update their dampings.
 
         Args:
             rows: (n,) the problems.
@@ -190,7 +192,7 @@ class TrustRegion:
         return better
 
     def refuse(self, rows: Index) -> Index:
-        """Damps problems (n,) whose steps are refused; returns those that have stalled."""
+        """Increase the damping of problems (n,) with refused steps; return the stalled ones."""
         self.damping[rows] = np.maximum(self.damping[rows], self._least_refused)
         self.damping[rows] *= self._growth[rows]
         self._growth[rows] *= 2.0

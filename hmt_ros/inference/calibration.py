@@ -1,15 +1,15 @@
-"""Whether densities are honest: where known values fall in the highest-density regions.
+"""Calibration of densities: the levels of known values in highest-density regions.
 
-The level of a value x under a density p is the probability content of the smallest region that
-holds x,
+The level of a value x under a density p is the probability content of the smallest highest-density
+region that contains x,
 
     level(x) = P(p(X) > p(x)),  X ~ p,
 
 so that the highest-density region of probability q holds x exactly when level(x) <= q. Values that
 were drawn from their densities have levels that are uniform on [0, 1], whatever the densities are:
-the share of levels up to q is the coverage of the region q, to be compared with q. That best-of-N
-errors alone reward dishonest densities is shown by Pierzchlewicz et al., "Multi-hypothesis 3D human
-pose estimation metrics favor miscalibrated distributions" (2022).
+the share of levels up to q is the coverage of the region q, to be compared with q. Best-of-N errors
+alone reward miscalibrated densities, see Pierzchlewicz et al., "Multi-hypothesis 3D human pose
+estimation metrics favor miscalibrated distributions" (2022).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def levels_of(at_points: Array, at_samples: Array) -> Array:
 
 
 def stratified_samples(mixture: GaussianMixture, count: int, rng: np.random.Generator) -> Array:
-    """Draws points (count, d), each component as often as its weight says, but for rounding."""
+    """Draw points (count, d), with numbers per component proportional to the weights."""
     cumulated = np.cumsum(mixture.normalised().weights)
     at = (np.arange(count) + rng.random()) / count
     owners = np.minimum(np.searchsorted(cumulated, at, side='right'), len(mixture) - 1)
@@ -52,7 +52,7 @@ def marginal_log_densities(mixture: GaussianMixture, points: ArrayLike, size: in
     """log p of consecutive groups of `size` variables, (N, d / size), at points (N, d).
 
     Raises:
-        ValueError: the dimension is no multiple of the size.
+        ValueError: the dimension is not a multiple of the size.
     """
     x = np.asarray(points, dtype=np.float64)
     d = mixture.dimension

@@ -14,7 +14,7 @@ from hmt_ros.inference.linear_algebra import product
 def k_means(
     points: Array, count: int, rng: np.random.Generator, iterations: int = 25
 ) -> tuple[Array, Index]:
-    """Clusters of points (N, p), at most `count` of them, fewer where fewer points differ.
+    """Cluster points (N, p), into at most `count` clusters, fewer if fewer points differ.
 
     Returns:
         centres (K, p) and labels (N,). A cluster that loses all its points keeps its centre.
@@ -32,8 +32,8 @@ def spread_points(points: Array, count: int, rng: np.random.Generator) -> Index:
     """Indices of at most `count` of the points (N, p), spread like the data.
 
     The seeds of k-means++ [Arthur and Vassilvitskii, SODA 2007]: each next point is drawn in
-    proportion to its squared distance to the points before. The first few are spread as well. Of
-    equal points one is taken.
+    proportion to its squared distance to the points before. The first few are spread as well. Equal
+    points are selected once.
     """
     chosen = [int(rng.integers(len(points)))]
     distance = np.full(len(points), np.inf)
@@ -51,7 +51,7 @@ def spread_points(points: Array, count: int, rng: np.random.Generator) -> Index:
 def smallest_columns(values: Array, count: int) -> Index:
     """Columns (N, count), rising, of the smallest values (N, M) of each row.
 
-    Of equal values the first count: which numpy's own selection takes depends on the processor.
+    Ties are broken by position, because numpy's own selection depends on the processor.
     """
     last = np.partition(values, count - 1, axis=1)[:, count - 1, None]
     below, tied = values < last, values == last

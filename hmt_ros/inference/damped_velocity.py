@@ -1,14 +1,14 @@
-"""Second-order dynamics: the velocity of a pose is damped and driven by noise that is coupled.
+"""Second-order dynamics: the velocity of a pose is damped and driven by coupled noise.
 
     dx = v dt + dn,  E[dn dn'] = W dt              dv = -G v dt + dw,  E[dw dw'] = D dt
 
-with a diagonal damping G, a diagonal W and a full D: joints that move together change their
-velocities together. The velocity has the stationary covariance S_ij = D_ij / (G_i + G_j), and
+with a diagonal damping G, a diagonal W and a full D, which couples the velocities of joints that
+move together. The velocity has the stationary covariance S_ij = D_ij / (G_i + G_j), and
 
     x(t) ~ x + a v,   v(t) ~ b v,     a = (1 - exp(-G t)) / G,   b = exp(-G t)
     Q_xx = int a a' D + W t,   Q_xv = int a b' D,   Q_vv = int b b' D    (entry by entry, 0..t)
 
-The integrals are sums of exponentials; over short times, where these cancel, they are taken by
+The integrals are sums of exponentials; over short times, where these cancel, they are computed by
 Gaussian quadrature [Uhlenbeck and Ornstein 1930; Van Loan 1978 for the general case].
 """
 
@@ -25,7 +25,7 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import cholesky, inverse, product
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 
-# Nodes of the quadrature; it is exact to rounding while G t stays below the limit.
+# Nodes and weights of the quadrature, and the limit of G t below which it is exact to rounding.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _LONGEST = 4.0
 
@@ -38,16 +38,16 @@ class DampedVelocity(LinearGaussianDynamics):
     def of(
         cls, damping: ArrayLike, diffusion: ArrayLike, white: ArrayLike, *, step: float = 1.0
     ) -> DampedVelocity:
-        """The dynamics, which begin with a velocity of the stationary covariance.
+        """Return the dynamics, with the stationary covariance for the first velocity.
 
         Args:
             damping: (d,) G, share of the velocity lost per second.
             diffusion: (d, d) D, covariance that the velocity gains per second.
-            white: (d,) W, variance that the pose gains per second besides.
+            white: (d,) W, additional variance that the pose gains per second.
 
         Raises:
-            ValueError: shapes that do not fit, damping or white noise that is not positive, or a
-                diffusion that is not positive definite.
+            ValueError: shapes are inconsistent, damping or white noise is not positive, or the
+                diffusion is not positive definite.
         """
         rates = np.atleast_1d(np.asarray(damping, dtype=np.float64))
         own = np.atleast_1d(np.asarray(white, dtype=np.float64))

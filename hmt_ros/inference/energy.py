@@ -1,4 +1,4 @@
-"""Energies: minus the logarithm of the factors of a posterior, which add.
+"""Energies: minus the logarithms of the factors of a posterior; energies add.
 
     E(x) = - sum_i log p_i(x),     g = dE/dx,     H ~ d2E/dx2
 
@@ -21,12 +21,12 @@ from hmt_ros.inference.linear_algebra import product
 
 
 class Derivatives(IntEnum):
-    """Derivatives that an energy is asked for."""
+    """Derivatives requested from an energy."""
 
     NONE = 0
     GRADIENT = 1  # the gradient; a term may return a Hessian with it
     POSITIVE = 2  # gradient and a positive semi-definite Hessian: Gauss-Newton, or a majorising one
-    EXACT = 3  # gradient and the exact Hessian, where the term knows it; else as POSITIVE
+    EXACT = 3  # gradient and the exact Hessian if the term has it; else as POSITIVE
 
 
 class Energy(NamedTuple):
@@ -34,8 +34,8 @@ class Energy(NamedTuple):
 
     Attributes:
         value: (N,) nats.
-        gradient: (N, d); None: not asked for.
-        hessian: (N, d, d); None: not asked for.
+        gradient: (N, d); None: not requested.
+        hessian: (N, d, d); None: not requested.
     """
 
     value: Array
@@ -46,7 +46,7 @@ class Energy(NamedTuple):
         """Gradient and Hessian.
 
         Raises:
-            ValueError: they were not asked for.
+            ValueError: they were not computed.
         """
         if self.gradient is None or self.hessian is None:
             raise ValueError('the energy was computed without derivatives')
@@ -59,17 +59,17 @@ class EnergyTerm(Protocol):
     def energy(
         self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
     ) -> Energy:
-        """The energy at points x (n, d).
+        """Return the energy at points x (n, d).
 
         Args:
-            rows: (n,) the problem that each point belongs to: a term that differs from problem to
-                problem (another centre, texture or time) looks up its own data there.
+            rows: (n,) index of the problem of each point, for terms whose data (centre, texture or
+                time) differ between problems.
         """
         ...
 
 
 def add_energies(energies: Iterable[Energy]) -> Energy:
-    """The sum of energies of the same points, in their order."""
+    """Sum energies of the same points, in the given order."""
     first, *others = energies
     value, gradient, hessian = first
     if not others:
@@ -88,10 +88,10 @@ def add_energies(energies: Iterable[Energy]) -> Energy:
 
 @dataclass(frozen=True, eq=False)
 class EnergyFunction:
-    """A term that is written as a function.
+    """A term that wraps a function.
 
     Attributes:
-        function: maps points (n, d) and rows (n,) to value, gradient and Hessian, of any kind.
+        function: maps points (n, d) and rows (n,) to value, gradient and any kind of Hessian.
     """
 
     function: Callable[[Array, Index], tuple[Array, Array, Array]]
@@ -99,13 +99,13 @@ class EnergyFunction:
     def energy(
         self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
     ) -> Energy:
-        """See `EnergyTerm`; the derivatives are always there."""
+        """See `EnergyTerm`; derivatives are always returned."""
         return Energy(*self.function(x, rows))
 
 
 @dataclass(frozen=True, eq=False)
 class Sum:
-    """The product of factors: the sum of their energies, in the order in which they are given."""
+    """A product of factors: the sum of their energies, in the given order."""
 
     terms: tuple[EnergyTerm, ...]
 
@@ -124,7 +124,7 @@ class Quadratic:
 
     Attributes:
         centres: m, (d,) for all problems or (N, d).
-        precisions: P, (d,) of a diagonal, (d, d) for all problems, or (N, d, d).
+        precisions: P, (d,) diagonal or (d, d) for all problems, or (N, d, d).
     """
 
     centres: Array
@@ -180,7 +180,7 @@ class Student:
 
 
 def _pulls(term: Quadratic | Student, x: Array, rows: Index) -> tuple[Array, Array, Array]:
-    """x - m (n, d), P (x - m) (n, d) and P (n, d, d) of each point."""
+    """Return x - m (n, d), P (x - m) (n, d) and P (n, d, d) of each point."""
     offset = x - _of_rows(term.centres, rows)
     if term.precisions.ndim == 2:
         shape = (*x.shape, x.shape[1])

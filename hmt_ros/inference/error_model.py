@@ -1,13 +1,13 @@
-"""Information of measurements whose errors last: neighbours in space and time repeat each other.
+"""Information of measurements with correlated errors, in space and time.
 
     energy of cue g in an image     s_g E_g                        s_g: share that is independent
     its share in time               a_g(dt) = (1 - rho) / (1 + rho) = tanh(dt / (2 tau_g)),
                                     rho = exp(-dt / tau_g)
 
-An error that lasts for tau is an AR(1) process: between two measurements dt apart its correlation
-is rho. About a constant, n measurements in a row (n large) have the information of a(dt) n
-independent ones, so that each counts with the share a(dt) [Bartlett 1946]. For small dt it is
-dt / (2 tau): the information per second does not depend on the rate. For large dt it is 1.
+An error with the correlation time tau is an AR(1) process: its correlation between two measurements
+dt apart is rho. About a constant, n measurements in a row (n large) have the information of a(dt) n
+independent ones, so that each counts with the share a(dt) [Bartlett 1946]. For small dt it is dt /
+(2 tau): the information per second does not depend on the rate. For large dt it is 1.
 
 A lasting error cancels in differences: the change of a pose from one measurement to the next is
 measured with the new part of the error alone, 1 - rho^2 of its variance.
@@ -29,14 +29,14 @@ def seconds(nanoseconds: int) -> float:
 
 
 def share_of_time(dt: float, tau: float) -> float:
-    """The share a(dt) of an independent measurement that a measurement counts for.
+    """Return a(dt), the information of a measurement relative to an independent one.
 
     Args:
-        dt: time since the measurement before, s; infinite: there is none before.
-        tau: how long the errors last, s; 0: they are independent.
+        dt: time since the measurement before, s; infinite for the first one.
+        tau: correlation time of the errors, s; 0 for independent errors.
 
     Raises:
-        ValueError: a time that is negative or not a number.
+        ValueError: a time is negative or not a number.
     """
     if not (dt >= 0.0 and tau >= 0.0):
         raise ValueError(f'wanted times that are not negative, saw dt {dt} and tau {tau} s')
@@ -58,7 +58,7 @@ class CueErrors:
     constant: float = 0.0
 
     def share(self, dt: float) -> float:
-        """Share of the energy, or of its curvature, that an image adds dt s after the last one."""
+        """Share of its energy, or curvature, that an image adds dt s after the last one."""
         return self.independent * share_of_time(dt, self.time)
 
     def together(self, count: float) -> float:
@@ -72,7 +72,7 @@ class CueErrors:
         return 1.0 / (1.0 + self.constant * count)
 
     def of_changes(self, dt: float) -> float:
-        """Share of the curvature by which an image tells how a pose has changed in dt s.
+        """Share of the curvature of an image that measures the change of a pose in dt s.
 
         A lasting error has not changed: s / (1 - rho^2), by the variance of its new part.
         """
@@ -80,12 +80,12 @@ class CueErrors:
         return self.independent / new
 
     def lasting(self, dt: float) -> float:
-        """Ratio of both shares, 1 / (1 - rho)^2: variance that stays, over that of changes."""
+        """Ratio of both shares, 1 / (1 - rho)^2: lasting variance over variance of changes."""
         return self.of_changes(dt) / self.share(dt)
 
 
 def errors_of_cues(amounts: Mapping[str, float]) -> CueErrors:
-    """The one pair (s, tau) that stands for a likelihood made of several cues.
+    """Combine the errors of several cues in one likelihood to one pair (s, tau).
 
         s = sum_g c_g s_g / C,    s / tau = sum_g c_g s_g / tau_g / C,    C = sum_g c_g
 
@@ -98,7 +98,7 @@ def errors_of_cues(amounts: Mapping[str, float]) -> CueErrors:
         amounts: c_g by name of the cue in `ERRORS`, none negative, not all 0.
 
     Raises:
-        ValueError: amounts that are negative, not finite, or all 0.
+        ValueError: an amount is negative or not finite, or all are 0.
     """
     total = sum(amounts.values())
     if not (0.0 < total < math.inf and min(amounts.values()) >= 0.0):
@@ -111,8 +111,8 @@ def errors_of_cues(amounts: Mapping[str, float]) -> CueErrors:
     return CueErrors(share, share / rate)
 
 
-# Covariance of a pose given all images so far, relative to that given the last one by itself, which
-# counts with its own share of the evidence: `benchmarks/joint_errors.py`.
+# Covariance of a pose given all images so far, over that given the last image alone with its own
+# share of the evidence; see `benchmarks/joint_errors.py`.
 TOGETHER = 0.29
 
 # Chosen, not learned, at 30 and 3 images a second (docs/tracking.md). The prior of the pose is

@@ -14,7 +14,7 @@ from hmt_ros.inference.threads import in_threads
 
 Index = NDArray[np.int64]
 
-# Pairs that are worth a thread.
+# Minimum number of pairs per thread.
 LEAST_SHARED = 128
 
 

@@ -1,4 +1,4 @@
-"""L-BFGS: minimisation by gradients, with a line search that meets the strong Wolfe conditions.
+"""L-BFGS: minimisation by gradients, with a line search for the strong Wolfe conditions.
 
     d = -H g,   H from the last pairs of steps and changes of the gradient      [Nocedal, 1980]
     f(x + a d) <= f(x) + 1e-3 a g.d,   |g(x + a d).d| <= 0.9 |g.d|        [More, Thuente, 1994]
@@ -19,8 +19,8 @@ from hmt_ros.inference.arrays import Array
 
 DECREASE, CURVATURE, NARROW = 1e-3, 0.9, 0.1
 LARGEST_STEP = 1e10
-SEARCHES = 20  # evaluations in one line search at most
-# Ends of the descent: relative fall of the value, largest part of the gradient.
+SEARCHES = 20  # maximum number of evaluations in one line search
+# Convergence thresholds: relative decrease of the value, maximum absolute gradient component.
 LEAST_FALL, LEAST_GRADIENT = 1e7 * np.finfo(np.float64).eps, 1e-5
 
 Function = Callable[[Array], tuple[float, Array]]
@@ -29,13 +29,13 @@ Function = Callable[[Array], tuple[float, Array]]
 def descent(
     function: Function, start: Array, *, memory: int, most_evaluations: int
 ) -> Iterator[tuple[Array, float]]:
-    """Each next iterate and its value, until none is lower.
+    """Yield each next iterate and its value, until the value decreases no further.
 
     Args:
         function: value and gradient (n,) at a point (n,).
         start: (n,).
-        memory: number of pairs that are kept.
-        most_evaluations: no iterate follows on as many.
+        memory: number of stored pairs.
+        most_evaluations: number of evaluations after which the descent ends.
     """
     x = start
     value, gradient = function(x)
@@ -101,13 +101,13 @@ class _At:
 
 
 class LineSearch:
-    """A line search: `advance` takes the value and the slope at each step that it asks for.
+    """A line search: the caller evaluates `step` and passes value and slope to `advance`.
 
     Attributes:
         step: the next step to evaluate, or the one that was found.
-        found: whether it meets the conditions.
+        found: whether the step satisfies the conditions.
         ended: whether the search is over.
-        count: evaluations.
+        count: number of evaluations.
     """
 
     def __init__(self, value: float, slope: float, step: float) -> None:
@@ -129,7 +129,7 @@ class LineSearch:
         stuck = self._bracketed and (not low < here.step < high or high - low <= NARROW * high)
         at_end = here.step == LARGEST_STEP and lower and here.slope <= test
         if (lower and flat) or stuck or at_end:
-            # L-BFGS takes the step of a search that can not go on, too.
+            # L-BFGS also accepts the step of a search that can not continue.
             self.found = self.ended = True
             return
         shift = test if self._modified and here.value <= self._best.value and not lower else 0.0

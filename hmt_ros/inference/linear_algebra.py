@@ -2,8 +2,8 @@
 
 BLAS and LAPACK, which numpy calls, choose their kernels by processor, and these sum in different
 orders. The functions of this module sum in one order; they broadcast over leading axes, and a
-matrix without a result raises `numpy.linalg.LinAlgError`, as with numpy. They are made for
-matrices up to some hundreds of rows.
+matrix without a result raises `numpy.linalg.LinAlgError`, as with numpy. They are meant for
+matrices of up to some hundreds of rows.
 """
 
 from collections.abc import Callable
@@ -133,7 +133,7 @@ def singular_values(matrix: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 def pseudo_inverse(matrix: ArrayLike, tolerance: float = 1e-15) -> Array:
-    """Moore-Penrose inverse (..., n, m); singular values up to a share of the largest are 0."""
+    """Moore-Penrose inverse (..., n, m); singular values up to `tolerance` max s count as 0."""
     u, values, vt = singular_values(matrix)
     large = values > tolerance * values[..., :1]
     inverses = np.divide(1.0, values, out=np.zeros_like(values), where=large)

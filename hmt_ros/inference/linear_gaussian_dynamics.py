@@ -3,9 +3,9 @@
     dx = F x dt + dw,  E[dw dw'] = Qc dt     =>     p(x_{t+1} | x_t) = N(A x_t, Q)
     A = exp(F dt),  Q = int_0^dt exp(F s) Qc exp(F s)' ds                       [Van Loan 1978]
 
-so that gaps and uneven intervals need no further rule: the prediction over two intervals is that
-over their sum. The random walk has F = 0; at constant velocity the state is the pose and its
-velocity, and the acceleration is white.
+so that gaps and uneven intervals need no further rule: predicting over two intervals equals
+predicting over their sum. The random walk has F = 0; with constant velocity the state is the pose
+and its velocity, and the acceleration is white noise.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from hmt_ros.inference.linear_algebra import (
     symmetric_eigenvalues,
 )
 
-# Number of intervals whose transitions are kept.
+# Maximum number of intervals whose transitions are cached.
 MOST_INTERVALS = 64
 
 
@@ -41,8 +41,8 @@ class TrajectoryPrior:
     Attributes:
         precision: P.
         information: (T, n) h.
-        constant: c, nats; where nothing is known of the first pose its density is taken as 1.
-        dimension: d, the first variables of each state are the pose.
+        constant: c, nats; an unknown first pose has density 1.
+        dimension: d; the first d variables of each state are the pose.
     """
 
     precision: BlockTridiagonal
@@ -57,9 +57,9 @@ class TrajectoryPrior:
         return value + self.constant, moved - self.information
 
     def between(self, first: int, last: int, states: Array) -> TrajectoryPrior:
-        """The density of the states first <= t < last given the others, of one trajectory (T, n).
+        """Condition the states first <= t < last on the others of one trajectory (T, n).
 
-        Up to a factor: its constant is 0.
+        The density is unnormalised: its constant is 0.
         """
         information = self.information[first:last].copy()
         if first > 0:
@@ -73,7 +73,7 @@ class TrajectoryPrior:
 
 
 class Couplings(NamedTuple):
-    """What couples T states, by interval between two of them.
+    """Terms that couple T states, by the interval between two of them.
 
     Attributes:
         before, after, forth: (I, n, n) A' Q^-1 A, Q^-1 and Q^-1 A of the different intervals.
@@ -88,7 +88,7 @@ class Couplings(NamedTuple):
     log_determinants: Array
 
     def constant(self, noise: Array) -> float:
-        """-log of the densities at their modes, with factors (T-1,) on the noise, nats."""
+        """Return -log of the densities at their modes, nats, with factors (T-1,) on the noise."""
         n = self.before.shape[1]
         logs = n * elementary.log(2.0 * np.pi * noise) + self.log_determinants
         return 0.5 * float(logs.sum())
@@ -96,21 +96,22 @@ class Couplings(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LinearGaussianDynamics:
-    """Dynamics of a state of n variables, of which the first d are the pose.
+    """Dynamics of a state of n variables; the first d are the pose.
 
-    Use `random_walk`, `constant_velocity` or `DampedVelocity.of`, or any drift and diffusion.
+    Construct by `random_walk`, `constant_velocity` or `DampedVelocity.of`, or from any drift and
+    diffusion.
 
     Attributes:
         drift: (n, n) F, per second.
-        diffusion: (n, n) Qc, variance gained per second.
-        dimension: d, how many variables are observed; the others are velocities.
-        initial_mean: (n,) of the first state.
-        initial_precision: (n, n) of the first state; zeros: nothing is known.
-        step: interval between observations that come without stamps, s.
+        diffusion: (n, n) Qc, covariance gained per second.
+        dimension: d, number of observed variables; the others are velocities.
+        initial_mean: (n,) mean of the first state.
+        initial_precision: (n, n) precision of the first state; zeros where unknown.
+        step: interval between observations without stamps, s.
 
     Raises:
-        ValueError: shapes that do not fit, values that are not finite, a diffusion that is not
-            positive semi-definite.
+        ValueError: a shape is wrong, a value is not finite, or a diffusion is not positive
+            semi-definite.
     """
 
     drift: Array
@@ -151,10 +152,10 @@ class LinearGaussianDynamics:
 
     @classmethod
     def random_walk(cls, rates: ArrayLike, *, step: float = 1.0) -> LinearGaussianDynamics:
-        """First-order dynamics, x_{t+1} = x_t + noise; the first pose is unknown.
+        """Return first-order dynamics, x_{t+1} = x_t + noise; the first pose is unknown.
 
         Args:
-            rates: (d,) variances, or (d, d) covariance, that the pose gains per second.
+            rates: (d,) variances, or (d, d) covariance, gained by the pose per second.
         """
         diffusion = _matrix(rates)
         d = len(diffusion)
@@ -168,10 +169,10 @@ class LinearGaussianDynamics:
         *,
         step: float = 1.0,
     ) -> LinearGaussianDynamics:
-        """Second-order dynamics; the state is the pose, at first unknown, and its velocity.
+        """Return second-order dynamics; the state is the pose, unknown at first, and its velocity.
 
         Args:
-            rates: (d,) variances, or (d, d) covariance, that the velocity gains per second.
+            rates: (d,) variances, or (d, d) covariance, gained by the velocity per second.
             velocity_sigma: (d,) or scalar, standard deviation of the first velocity, per second.
         """
         white = _matrix(rates)
@@ -187,12 +188,12 @@ class LinearGaussianDynamics:
 
     @property
     def state_dimension(self) -> int:
-        """n."""
+        """Number of variables of a state, n."""
         return len(self.drift)
 
     @cached_property
     def transition(self) -> Callable[[float], tuple[Array, Array]]:
-        """A and Q, both (n, n), over an interval in seconds; those of the last ones are kept."""
+        """A and Q, both (n, n), over an interval in seconds; the most recent ones are cached."""
 
         def made(interval: float) -> tuple[Array, Array]:
             found = self._transition(interval)
@@ -204,7 +205,7 @@ class LinearGaussianDynamics:
 
     @cached_property
     def coupling(self) -> Callable[[float], tuple[Array, Array, Array, float]]:
-        """A' Q^-1 A, Q^-1 and Q^-1 A, all (n, n), and log |Q|, kept like transitions."""
+        """A' Q^-1 A, Q^-1 and Q^-1 A, all (n, n), and log |Q|; cached like transitions."""
         return lru_cache(MOST_INTERVALS)(self._coupling)
 
     def _coupling(self, interval: float) -> tuple[Array, Array, Array, float]:
@@ -214,7 +215,7 @@ class LinearGaussianDynamics:
         return product(a.T, forth), precision, forth, log_det
 
     def couplings(self, intervals: Array) -> Couplings:
-        """What couples states with intervals (T-1,) between them, s.
+        """Return the terms that couple states with intervals (T-1,) between them, s.
 
         Raises:
             ValueError: the noise over an interval is not positive definite.
@@ -236,7 +237,7 @@ class LinearGaussianDynamics:
         return np.asarray(0.5 * (result + result.T), dtype=np.float64)
 
     def states(self, covariances: Array) -> Array:
-        """Covariances (K, n, n) of states with poses of covariances (K, d, d).
+        """Return covariances (K, n, n) of states from covariances (K, d, d) of their poses.
 
         All velocities have the covariance of the first one.
         """
@@ -251,7 +252,7 @@ class LinearGaussianDynamics:
     def predict_poses(
         self, means: Array, covariances: Array, interval: float
     ) -> tuple[Array, Array]:
-        """Predicted means (K, d) and covariances (K, d, d) of poses of unknown velocities.
+        """Predict means (K, d) and covariances (K, d, d) of poses with unknown velocities.
 
         Args:
             means, covariances: (K, d) and (K, d, d) of the poses.
@@ -276,7 +277,7 @@ class LinearGaussianDynamics:
         return a, 0.5 * (q + q.T)
 
     def predict(self, means: Array, covariances: Array, interval: float) -> tuple[Array, Array]:
-        """Means (K, n) and covariances (K, n, n) of states after an interval in seconds."""
+        """Predict means (K, n) and covariances (K, n, n) of states after an interval in seconds."""
         a, q = self.transition(interval)
         if not self.drift.any():
             return means, covariances + q
@@ -285,11 +286,11 @@ class LinearGaussianDynamics:
     def prior(
         self, intervals: Array, *, initial: bool = True, noise: ArrayLike = 1.0
     ) -> TrajectoryPrior:
-        """The density of trajectories with these intervals (T-1,) between their states, s.
+        """Return the density of trajectories with given intervals between their states.
 
         Args:
-            intervals: (T-1,).
-            initial: whether the prior of the first state is part of it.
+            intervals: (T-1,) intervals, s.
+            initial: whether to include the prior of the first state.
             noise: (T-1,) or scalar, factor on the noise over each interval.
 
         Raises:
@@ -322,7 +323,7 @@ class LinearGaussianDynamics:
 
 
 def _precision_of(covariance: Array) -> tuple[Array, float]:
-    """Inverse and log determinant; a diagonal covariance has an exactly diagonal inverse."""
+    """Return inverse and log determinant; diagonal covariances give exactly diagonal inverses."""
     diagonal = np.diagonal(covariance)
     if not (covariance - np.diag(diagonal)).any() and (diagonal > 0).all():
         return np.diag(1.0 / diagonal), float(elementary.log(diagonal).sum())

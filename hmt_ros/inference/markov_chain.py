@@ -4,7 +4,7 @@
     update    log p_i <- log p_i + l_i - const      l_i: log likelihood of an observation in state i
 
 Two states have the closed form  p_1 <- u + (p_1 - u) exp(-(q_01 + q_10) dt),  u = q_01 / (q_01 +
-q_10). Time can be divided at will, so that no result counts images.
+q_10). Results do not depend on the division of time into steps, nor on the frame rate.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class MarkovChain:
     """The states of a chain and the rates between them.
 
     Attributes:
-        rates: (n, n) from state i to state j, 1/s; the diagonal does not count.
+        rates: (n, n) rates from state i to state j, 1/s; the diagonal is ignored.
     """
 
     rates: Array
@@ -44,7 +44,7 @@ class MarkovChain:
 
     @cached_property
     def usual(self) -> Array:
-        """Probabilities (n,) after a long time in which nothing was observed."""
+        """Stationary probabilities (n,)."""
         # p Q = 0, one equation of which follows from the others, and sum p = 1.
         equations = self.generator.T.copy()
         equations[-1] = 1.0
@@ -54,7 +54,7 @@ class MarkovChain:
 
     @cached_property
     def _rate(self) -> float:
-        """Rate at which two states forget which one it was, 1/s."""
+        """Decay rate of a chain of two states to its stationary probabilities, 1/s."""
         return float(self.rates[0, 1] + self.rates[1, 0])
 
     def transition(self, dt: float) -> Array:

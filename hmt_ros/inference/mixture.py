@@ -26,16 +26,16 @@ from hmt_ros.inference.random_numbers import standard_normals
 class GaussianMixture:
     """A mixture of K Gaussians over R^d.
 
-    Weights need not sum to 1: the modes of a likelihood are an unnormalised mixture. Densities and
-    samples are those of the mixture as it stands; `normalised()` makes the weights sum to 1.
+    Weights need not sum to 1: the modes of a likelihood are an unnormalised mixture. `normalised()`
+    makes the weights sum to 1.
 
     Attributes:
-        weights: (K,) not negative.
+        weights: (K,) nonnegative.
         means: (K, d).
         covariances: (K, d, d) symmetric, positive definite.
 
     Raises:
-        ValueError: shapes that contradict each other, values that are not finite, negative weights.
+        ValueError: shapes are inconsistent, a value is not finite, or a weight is negative.
     """
 
     weights: Array
@@ -139,7 +139,7 @@ class GaussianMixture:
         """The same mixture with weights that sum to 1.
 
         Raises:
-            ValueError: no component, or all weights are zero.
+            ValueError: there is no component, or all weights are zero.
         """
         total = self.weights.sum()
         if not total > 0:
@@ -153,6 +153,6 @@ class GaussianMixture:
         return self[np.argsort(-self.weights, kind='stable')]
 
     def __getitem__(self, index: Any) -> GaussianMixture:
-        """The mixture of some of the components; weights are kept as they are."""
+        """Select components; their weights are unchanged."""
         i = np.atleast_1d(np.arange(len(self))[index])
         return GaussianMixture(self.weights[i], self.means[i], self.covariances[i])

@@ -7,7 +7,7 @@
 This is the backward half of forward filtering, backward smoothing [Doucet, Godsill and Andrieu,
 2000]. The evidence of an image for a mode is a factor of w_k alone: it cancels in P(j | k), the
 probability that mode k continues mode j of the image before, and reaches image t by (1) and (2). So
-(2) and (3) are exact for the filter's own chain, and have no constant that the filter has not.
+(2) and (3) are exact for the filter's own chain, and add no parameters.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class Link(NamedTuple):
 
     Attributes:
         weights: (K,) posterior probabilities given this image and those before.
-        origins: (K, M) probability that each mode continues each of the M of the image before; rows
-            sum to 1. M is 0 where the chain begins.
+        origins: (K, M) probability that each mode continues each of the M modes of the image
+            before; rows sum to 1. M is 0 at the start of the chain.
     """
 
     weights: Array
@@ -35,7 +35,7 @@ class Link(NamedTuple):
 
 
 def backward_weights(links: Sequence[Link]) -> list[Array]:
-    """Probabilities (K_t,) of the modes at each time given all images, equations (1) and (2)."""
+    """Return probabilities (K_t,) of modes at each time given all images, by (1) and (2)."""
     result = [links[-1].weights]
     for link in reversed(links[1:]):
         result.append(product(result[-1], link.origins))
@@ -43,16 +43,16 @@ def backward_weights(links: Sequence[Link]) -> list[Array]:
 
 
 def drawn_paths(links: Sequence[Link], count: int, seed: int) -> tuple[Index, Array]:
-    """Paths drawn from (3), each with a share of the weight of its first mode given all images.
+    """Draw paths from (3), which share the weight of their first mode given all images.
 
-    Drawn forwards, with P(k | j) = W_(t+1)(k) P(j | k) / W_t(j). Each mode of the oldest image
-    begins at least one path and has its weight (2) exactly, however small it is. Paths through one
-    mode are spread over what follows systematically, in a random order, so that their numbers
-    are as even as can be.
+    Paths are drawn forwards, with P(k | j) = W_(t+1)(k) P(j | k) / W_t(j). Each mode of the oldest
+    image with positive weight starts at least one path and keeps its weight (2) exactly, however
+    small it is. Paths through one mode are distributed over its successors by systematic sampling
+    in a random order.
 
     Args:
-        count: of paths, about.
-        seed: of the order.
+        count: approximate number of paths.
+        seed: random seed.
 
     Returns:
         Modes (N, T) of the paths, and their weights (N,), which sum to 1.
@@ -78,12 +78,13 @@ def drawn_paths(links: Sequence[Link], count: int, seed: int) -> tuple[Index, Ar
 
 
 def reachable_origins(away: Array, weights: Array, reach: float) -> Array:
-    """Origins (K, M) of modes whose ancestry nobody has told: all that are within reach.
+    """Return origins (K, M) of modes of unknown ancestry: all modes within reach.
 
     Args:
         away: (K, M) distances from the modes of the image before, m.
         weights: (M,) of the modes of the image before.
-        reach: distance that a body moves meanwhile, m; where no mode is within reach, all are.
+        reach: maximum distance of motion between the images, m; without a mode within reach, all
+            count.
     """
     near = (away <= reach) * weights
     lost = ~near.any(1)

@@ -1,13 +1,13 @@
-"""States of modes, poses with their velocities: predicted, and corrected by where poses were found.
+"""States of modes, poses with velocities: predicted, and conditioned on the fitted poses.
 
 A mode's pose x and velocity v have one Gaussian. An image shows only x: when it has been found
 at x* with the covariance P*, the prediction N((x, v), P) is conditioned on it,
 
     G = P_vx P_xx^-1,    v* = v + G (x* - x),    P*_vv = P_vv - G P_xv + G P* G',    P*_vx = G P*
 
-which is the Kalman filter where the energy of the image is quadratic. Where a limb has jumped its
-displacement is no motion: its velocity is then unknown. Its new place is as uncertain as after a
-random walk at the rates of the body; jumps are searched within that range, too.
+which is the Kalman filter where the energy of the image is quadratic. If a limb has jumped, its
+displacement is no motion, and its velocity is then unknown. Its new position is as uncertain as
+after a random walk at the rates of the body; this also is the search range of jumps.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hmt_ros.core import correct_states, fuse, widen_precisions
 from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 
-# Variance of a variable that may be anywhere, as it jumped, rad^2 or m^2: as good as infinite.
+# Variance of a variable that jumped, practically infinite, rad^2 or m^2.
 UNKNOWN_VARIANCE = 1e6
 
 
@@ -30,11 +30,11 @@ class PredictedStates:
     """States of K modes at the time of the next image.
 
     Attributes:
-        dynamics: that predicted them.
+        dynamics: dynamics of the prediction.
         means: (K, n); the first d are the pose, which may lie beyond the limits of the body.
         covariances: (K, n, n).
-        wandered: (d,) variances by which jumps may miss; zeros where the poses walk randomly, which
-            leaves room enough.
+        wandered: (d,) additional variances for jumps; zeros for random walks, whose variances
+            suffice.
     """
 
     dynamics: LinearGaussianDynamics
@@ -55,7 +55,7 @@ class PredictedStates:
 
     @property
     def searched(self) -> Array:
-        """Covariances (K, d, d) of the poses among which jumps are searched."""
+        """Covariances (K, d, d) of the search for jumps."""
         return self.pose_covariances + np.diag(self.wandered)
 
     def covariances_of(self, ancestors: Index, jumped: Mask) -> Array:
@@ -74,12 +74,12 @@ class PredictedStates:
     def given(
         self, ancestors: Index, jumped: Mask, poses: Array, found: Array
     ) -> tuple[Array, Array]:
-        """Velocities (N, d) and covariances (N, n, n) of states whose poses have been found.
+        """Return velocities (N, d) and covariances (N, n, n) of states given their poses.
 
         Args:
             ancestors: (N,) mode that each was predicted from.
-            jumped: (N, d) degrees of freedom that did not move, but jumped.
-            poses: (N, d) where the poses are.
+            jumped: (N, d) whether a degree of freedom jumped instead of moving.
+            poses: (N, d) the poses.
             found: (N, d, d) their covariances.
         """
         (count, d), n = poses.shape, self.dynamics.state_dimension
@@ -109,7 +109,7 @@ class Predicted(NamedTuple):
 
 
 def fused(a: Array, b: Array) -> Array:
-    """Covariances (N, d, d) of products of Gaussians of covariances (N, d, d) both."""
+    """Return covariances (N, d, d) of products of Gaussians with covariances (N, d, d)."""
     result = np.empty(a.shape)
     fuse(np.ascontiguousarray(a), np.ascontiguousarray(b), result)
     return result

@@ -6,11 +6,11 @@ import numpy as np
 
 from hmt_ros.inference.arrays import Array
 
-# Where the ziggurat of numpy's normals ends. It takes numbers beyond from a logarithm of the C
-# library, which depends on the processor.
+# End of the ziggurat of numpy's normals. Numbers beyond use the logarithm of the C library, which
+# depends on the processor.
 _END = 3.6541528853610088
 
 
 def standard_normals(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
-    """Numbers of a normal distribution, except that three in 10 000 lie beyond and are `_END`."""
+    """Draw standard normal numbers, clipped at `_END`, which affects three in 10 000."""
     return np.clip(rng.standard_normal(shape), -_END, _END)

@@ -1,19 +1,20 @@
-"""Mixtures of fewer components that stand for the same density.
+"""Reduction of mixtures to fewer components that approximate the same density.
 
 Components are merged into one Gaussian with their weight, mean and covariance,
 
     w = sum_i w_i,   m = sum_i w_i m_i / w,   S = sum_i w_i (S_i + (m_i - m) (m_i - m)') / w,
 
-so that the mean and the covariance of the whole mixture stay. The choice of components differs:
+so that the mean and the covariance of the whole mixture are preserved. The functions differ in the
+choice of components:
 
 - `merged_pairwise`: the pair that costs least by the upper bound on the Kullback-Leibler divergence
   that its merge causes [Runnalls, IEEE TAES 2007], until few are left,
 
       B(i, j) = 1/2 ((w_i + w_j) log|S_ij| - w_i log|S_i| - w_j log|S_j|);
 
-- `merged_if_close`: the closest pair, until none is closer than a distance;
-- `reduced`: clusters of means, which then descend a bound on the divergence from the large mixture
-  to the small one [Goldberger and Roweis, NIPS 2004].
+- `merged_if_close`: the closest pair, until no pair is closer than a distance;
+- `reduced`: clusters of means, refined to lower a bound on the divergence from the large mixture to
+  the small one [Goldberger and Roweis, NIPS 2004].
 """
 
 from __future__ import annotations
@@ -33,16 +34,15 @@ from hmt_ros.inference.linear_algebra import (
 )
 from hmt_ros.inference.mixture import GaussianMixture
 
-# Components with a smaller share than this of the weight are dropped by `reduced`.
+# Share of the weight below which `reduced` drops a component.
 NEGLIGIBLE = 1e-8
 
 
 def merged(mixture: GaussianMixture, share: Array) -> GaussianMixture:
-    """The mixture whose components have the moments of those that they stand for.
+    """Merge components to new ones with the same moments.
 
     Args:
-        share: (K, B) share of each component that goes to each of B new ones; a new one that gets
-            nothing is left out.
+        share: (K, B) share of each component in each of B new ones; empty new ones are left out.
     """
     mass = share * mixture.weights[:, None]
     total = mass.sum(0)
@@ -59,7 +59,7 @@ def merged(mixture: GaussianMixture, share: Array) -> GaussianMixture:
 
 
 def merged_pairwise(mixture: GaussianMixture, count: int) -> GaussianMixture:
-    """At most `count` components, by merging the pair that costs least.
+    """Reduce to at most `count` components, by merging the pair of least cost.
 
     Raises:
         ValueError: count < 1.
@@ -70,10 +70,10 @@ def merged_pairwise(mixture: GaussianMixture, count: int) -> GaussianMixture:
 
 
 def merged_if_close(mixture: GaussianMixture, distance: float) -> GaussianMixture:
-    """The mixture with components merged, the closest first, until none are closer than a distance.
+    """Merge components, the closest first, until no pair is closer than a distance.
 
     Args:
-        distance: between means, in standard deviations of the average of two covariances.
+        distance: distance of means, in standard deviations of the average of both covariances.
     """
     return _merged_pairs(mixture, _squared_distances, lambda _, cost: cost < distance**2)
 
@@ -85,7 +85,7 @@ PairCosts = Callable[[Array, Array, Array, Array, Index], Array]
 def _merged_pairs(
     mixture: GaussianMixture, cost: PairCosts, go_on: Callable[[int, float], bool]
 ) -> GaussianMixture:
-    """Merges the pair of least cost while the number left and that cost say so."""
+    """Merge the pair of least cost while `go_on` of the remaining number and this cost is true."""
     mixture = mixture[mixture.weights > 0] if (mixture.weights == 0).any() else mixture
     w, m, s = (np.array(x) for x in (mixture.weights, mixture.means, mixture.covariances))
     count = len(w)
@@ -111,7 +111,7 @@ def _merged_pairs(
 
 
 def _pair_moments(w: Array, m: Array, s: Array, i: int, j: int) -> tuple[float, Array, Array]:
-    """Weight, mean and covariance of the components i and j together."""
+    """Return weight, mean and covariance of the components i and j together."""
     total = w[i] + w[j]
     a, b = w[i] / total, w[j] / total
     offset = m[j] - m[i]

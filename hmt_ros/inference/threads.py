@@ -1,6 +1,7 @@
-"""Work shared among threads, in calls that release the interpreter lock, with the same results.
+"""Work shared among threads, in calls that release the interpreter lock, with unchanged results.
 
-Each piece is worked on alone and stays in its place, so that nothing depends on their number.
+Each piece is computed independently and keeps its place, so results do not depend on the number of
+threads.
 """
 
 from __future__ import annotations
@@ -12,13 +13,13 @@ from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
-# Threads at most, however many cores there are.
+# Maximum number of threads, for any number of cores.
 MOST_THREADS = 8
 _most = MOST_THREADS
 
 
 def limit_threads(count: int) -> None:
-    """Shares nothing among more threads than this in this process, whatever is asked for."""
+    """Cap the number of worker threads of this process."""
     global _most
     _most = min(count, MOST_THREADS)
 
@@ -30,9 +31,9 @@ def in_threads(
 
     Args:
         work: on the poses from one number up to another.
-        least: number of poses that are worth a thread.
-        threads: their number at most; 0: one a core, up to `MOST_THREADS`, but for one core that is
-            left to a camera, a smoother and subscribers.
+        least: minimum number of poses per thread.
+        threads: maximum number of threads; 0: one per core, up to `MOST_THREADS`, with one core
+            left for a camera, a smoother and subscribers.
     """
     threads = min(threads or _cores(), _most, count // least)
     if threads < 2:
@@ -46,10 +47,10 @@ def in_threads(
 
 
 def together(calls: Sequence[Callable[[], Any]], threads: int = 0) -> list[Any]:
-    """Results of some calls, shared among threads as poses are.
+    """Return the results of calls, shared among threads as in `in_threads`.
 
     Args:
-        calls: none of which calls this or `in_threads`.
+        calls: functions that call neither this nor `in_threads`.
     """
     results: list[Any] = [None] * len(calls)
 
@@ -66,7 +67,7 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(MOST_THREADS, thread_name_prefix='hmt_ros')
 
 
-# A child of fork has the pool, but none of its threads.
+# A forked child inherits the pool, but none of its threads.
 os.register_at_fork(after_in_child=_pool.cache_clear)
 
 

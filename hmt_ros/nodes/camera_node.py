@@ -48,15 +48,16 @@ from msg_tools.messages.images import image_message
 
 NAME = 'camera_node'
 FRAME_ID = 'camera_optical_frame'
-# Images a second of a file that does not give its rate.
+# Assumed image rate of a file that does not give it, 1/s.
 _USUAL_RATE = 30.0
-# Time without an image after which a device counts as gone, and between attempts to open it, s.
+# Time without an image after which a device counts as unplugged, and interval of attempts to open
+# it, s.
 _PATIENCE, _REOPENED = 2.0, 1.0
 _GLANCE, _CONNECTING = 0.05, 0.5
-# Time within which a node that is active is found among the subscribers, s: participants announce
-# themselves every 3 s.
+# Time limit for an active node to be discovered as subscriber, s: participants announce themselves
+# every 3 s.
 _SUBSCRIBING = 5.0
-# Time after which a node that is not active yet is asked, and named, again, s.
+# Interval between reports of nodes that are not active yet, s.
 _AGAIN = 10.0
 
 
@@ -85,10 +86,10 @@ class Video:
         loop, speed: of a file, see `CameraNodeParameters`.
 
     Attributes:
-        is_file: whether it is a file, which has an end.
+        is_file: whether the source is a file.
 
     Raises:
-        ValueError: it can not be opened; one line.
+        ValueError: the source can not be opened; one line.
     """
 
     def __init__(self, source: str, *, loop: bool = False, speed: float = 1.0) -> None:
@@ -102,7 +103,7 @@ class Video:
         if not self._capture.isOpened():
             raise ValueError(f'{source} can not be opened; wanted a webcam that nobody uses')
         if self.is_file and is_mirrored(display_matrix(Path(source)) or STORED):
-            # OpenCV would turn it by 180 degrees.
+            # OpenCV would turn mirrored images by 180 degrees.
             raise ValueError(
                 f'{source}: its metadata mirror the images; write them as players show them, by '
                 f'ffmpeg -i {source} shown.mp4'
@@ -113,11 +114,11 @@ class Video:
     def images(
         self, stopped: threading.Event, warn: Callable[[str], Any]
     ) -> Iterator[tuple[Image, int | None]]:
-        """The images, (H, W, 3) BGR, and when they are due after the first of a file, ns.
+        """Images (H, W, 3) BGR, with their times in a file after its first image, ns.
 
         Args:
-            stopped: ends them.
-            warn: takes a line when a device is gone, and when it is back.
+            stopped: ends the iteration.
+            warn: receives a line when a device is unplugged, and when it is back.
         """
         start, number, seen, again, gone = time.monotonic(), 0, time.monotonic(), 0, False
         while not stopped.is_set():
@@ -151,12 +152,12 @@ class Video:
                 stopped.wait(_GLANCE)
 
     def close(self) -> None:
-        """Gives the device back."""
+        """Releases the device."""
         self._capture.release()
 
 
 def main(args: list[str] | None = None) -> int:
-    """Publishes until the video ends or a signal comes; returns 0, or 1 without a camera."""
+    """Publishes until the video ends or a signal arrives; returns 0, or 1 after an error."""
     arguments = sys.argv[1:] if args is None else args
     stopped = threading.Event()
     on_signals(lambda *_: stopped.set())
@@ -208,7 +209,7 @@ def _angle(text: str) -> float:
 
 
 def _await_active(node: Any, names: list[str], stopped: threading.Event) -> None:
-    """Returns when lifecycle nodes of these names are active, or when stopped."""
+    """Waits until the lifecycle nodes of these names are active, or until stopped."""
     from lifecycle_msgs.msg import State
     from lifecycle_msgs.srv import GetState
 
@@ -229,7 +230,7 @@ def _await_active(node: Any, names: list[str], stopped: threading.Event) -> None
 
 
 def _await_subscriber(node: Any, images: Any, stopped: threading.Event, patience: float) -> None:
-    """Returns when somebody subscribes to the images, after this many seconds, or when stopped."""
+    """Waits for a subscriber to the images, for at most `patience` s, or until stopped."""
     end = time.monotonic() + patience
     while not images.get_subscription_count() and not stopped.is_set() and time.monotonic() < end:
         rclpy.spin_once(node, timeout_sec=_GLANCE)
@@ -255,7 +256,7 @@ def _show(
         node.get_logger().info(f'{given.video} starts when somebody subscribes to {images.topic}')
         _await_subscriber(node, images, stopped, math.inf)
     if video.is_file:
-        # The other side may not know yet that it is connected.
+        # The subscriber may not have discovered the publisher yet.
         stopped.wait(_CONNECTING)
     camera, messages, count, first = None, RosbagsMessages(), 0, 0
     for image, due in video.images(stopped, node.get_logger().warn):
@@ -268,7 +269,7 @@ def _show(
         infos.publish(serialise(info))
         if images.get_subscription_count():
             images.publish(serialise(image_message(messages, image, stamp, given.frame_id)))
-        # Whoever asks for its parameters waits for an answer.
+        # Answers requests for the parameters of the node.
         rclpy.spin_once(node, timeout_sec=0.0)
         count += 1
     over = '' if stopped.is_set() or not video.is_file else '; the file is over'
@@ -276,7 +277,7 @@ def _show(
 
 
 def _camera(node: Any, given: argparse.Namespace, size: tuple[int, int]) -> Camera:
-    """The calibration; a warning where it is assumed."""
+    """The calibrated camera; warns if a usual field of view is assumed."""
     if given.calibration is not None:
         return read_camera(given.calibration, size, node.get_logger().warn)
     if given.fov is None:

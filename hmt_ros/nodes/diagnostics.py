@@ -1,6 +1,6 @@
 """Diagnostics of a node: rates of messages, and events of the middleware.
 
-Without these events a publisher of an incompatible quality of service goes unnoticed.
+Without these events, a publisher with an incompatible quality of service would go unnoticed.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ class Rates:
     """Rates in the last period of the diagnostics.
 
     Args:
-        name: of the messages that are counted, 'images'.
-        done: name of those that were used, 'tracked'.
+        name: of the counted messages, such as 'images'.
+        done: name of the used messages, such as 'tracked'.
 
     Attributes:
         name: of the messages.
         change: of the counts in the period.
-        computing: time that a message takes, in words.
+        computing: text on the computing time of a message.
     """
 
     def __init__(self, name: str, done: str) -> None:
@@ -48,11 +48,11 @@ class Rates:
         """Ends a period.
 
         Args:
-            counts: 'received', 'dropped', 'faults', 'lost' and those used, since the start.
+            counts: 'received', 'dropped', 'faults', 'lost' and used messages, since the start.
         """
         now = time.monotonic()
         self._seconds, self._began = max(now - self._began, 1e-3), now
-        # A node that was configured anew counts anew.
+        # Counts restart at 0 when the node is configured again; a Counter drops negative changes.
         self.change, self._counts = counts - self._counts, counts
         self._waiting, self._durations = waiting, durations
         if durations:
@@ -93,7 +93,7 @@ class Rates:
 
 
 def trouble_of_period(state: SessionState, rates: Rates, silent: SilentTopics) -> str:
-    """Trouble of the last period, the reason first; '' if there was none."""
+    """Text on the trouble of the last period, with its cause; '' without trouble."""
     name, why = rates.name, '; '.join(silent.texts.values())
     if rates.change['dropped']:
         held_up = f'waits for {state.held_up}' if state.held_up else rates.computing
@@ -110,15 +110,15 @@ def trouble_of_period(state: SessionState, rates: Rates, silent: SilentTopics) -
 
 
 class MiddlewareEvents:
-    """Counts lost messages and partners that do not fit, and warns of the first of each kind.
+    """Counts lost messages and incompatible partners, and warns of the first of each kind.
 
-    Callbacks and `forget` are for the thread of the executor, the others for any.
+    Callbacks and `forget` are for the executor's thread, other methods for any thread.
     """
 
     def __init__(self, warn: Callable[[str], None]) -> None:
         self._warn = warn
         self._counts: Counter[str] = Counter()
-        # That the last partner which does not fit has another of, by partners and topic.
+        # Differing policy of the last incompatible partner, by kind of partner and topic.
         self._policies: dict[str, str] = {}
 
     def of_subscription(self, topic: str) -> SubscriptionEventCallbacks:
@@ -170,8 +170,8 @@ class MiddlewareEvents:
         return {'incompatible_qos': incompatible, 'incompatible_type': other_type}
 
     def deaf_topic(self, subscriptions: Iterable[Any]) -> str:
-        """A topic whose publishers all have a quality of service that does not fit, and why."""
-        # The other thread may be closing them.
+        """Text on a topic whose publishers all have an incompatible quality of service, or ''."""
+        # Another thread may close the subscriptions at the same time.
         with suppress(InvalidHandle):
             for subscription in list(subscriptions):
                 topic = subscription.topic_name
@@ -192,7 +192,7 @@ class MiddlewareEvents:
         return [(_LOST, str(self.lost)), *((what, str(count)) for what, count in counts)]
 
     def forget(self) -> None:
-        """Forgets the publishers that did not fit; those that still exist will be found again."""
+        """Forgets incompatible publishers; those that still exist are found again."""
         self._policies.clear()
 
     def _count(self, what: str, count: int, text: str) -> None:
@@ -202,7 +202,7 @@ class MiddlewareEvents:
 
 
 def _policy(event: Any) -> str:
-    """Name of the policy that does not fit."""
+    """Name of the incompatible policy."""
     try:
         return str(qos_policy_name_from_kind(event.last_policy_kind)).lower()
     except ValueError:

@@ -1,13 +1,13 @@
-"""The threads that estimate: they give the sessions of a process their messages.
+"""The estimating threads: they pass messages to the sessions of a process.
 
-Messages wait in a bounded queue of each session, in the order of their arrival. A session takes in
-all that has come before it estimates again, so that a node that is late goes on with the newest
-image for which all other inputs are there. Older images are dropped; nothing else is.
+Each session has a bounded queue of messages, in the order of their arrival. A session reads all
+waiting messages before it estimates again, so that a late node continues with the newest image for
+which all other inputs are there. Only older images are dropped.
 
-The sessions that lead to a pose share one thread and take turns, in the order in which they use
-each other's results. What can wait for the pose has a thread of its own, which begins with a
-message when the other one has nothing to do, or once the message has waited for `LONGEST_WAIT`. The
-messages of a session keep their order, so its results do not depend on turns.
+The sessions that contribute to a pose share one thread and take turns, in the order in which they
+use each other's results. Sessions that can wait for the pose have a second thread, which handles a
+message when the first one is idle, or once the message has waited for `LONGEST_WAIT`. The messages
+of a session keep their order, so its results do not depend on turns.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.headers import stamp_in
 from msg_tools.messages.images import decode_image
 
-# Time after which a message that can wait is handled although others wait, s.
+# Longest time that a message waits for the other thread, s.
 LONGEST_WAIT = 0.1
-# Pictures that the sessions of a process share, the newest.
+# Number of newest decoded images that the sessions of a process share.
 SHARED = 4
 _RESTART = 'restart'
-# Number of dropped images, the newest, that are reported one by one; the others are only counted.
+# Number of newest dropped images that are reported one by one; the others are only counted.
 _ANSWERED = 100
-# Arrivals of messages that are remembered until their estimates.
+# Maximum number of arrival times that are kept until the estimate of their image.
 _REMEMBERED = 1000
 
 
@@ -46,9 +46,9 @@ class Waiting(NamedTuple):
 
     Attributes:
         source: its origin.
-        content: reads the message, and raises an Exception of any kind where it can not be read; or
-            does what is asked for.
-        arrival: when it came, in seconds of a clock that does not jump.
+        content: function that reads the message, or raises any Exception if it is unreadable; or
+            that executes the request.
+        arrival: time of arrival by a monotonic clock, s.
         stamp_ns: of its header; 0 where it has none.
     """
 
@@ -59,10 +59,10 @@ class Waiting(NamedTuple):
 
 
 def received(data: bytes, of: SubscribedTopic) -> Waiting:
-    """A message that has come now; whoever wants it, it is read once."""
+    """A message that arrived now; it is read at most once for all sessions."""
     read: Callable[[], Any] = cache(partial(deserialise, data, of.msgtype))
     if len(data) > of.largest:
-        # It is not kept.
+        # Free its memory.
         read = partial(_refuse, f'it has {len(data)} bytes, the limit is {of.largest}')
     stamp = stamp_in(data) if opens_with_header(of.msgtype) else 0
     return Waiting(of.source, read, time.monotonic(), stamp)
@@ -77,8 +77,8 @@ class Duration(NamedTuple):
 
     Attributes:
         latency: from the arrival of its message, s.
-        whole: from the bytes of its message to the last one that it led to, s.
-        publishing: part of it for making messages into bytes and publishing them, s.
+        whole: from reading its message to publishing the last result, s.
+        publishing: part of `whole` for serialising and publishing, s.
     """
 
     latency: float
@@ -87,12 +87,12 @@ class Duration(NamedTuple):
 
 
 class Arrived(NamedTuple):
-    """Messages that have come since the last time.
+    """Messages that were taken out of a queue.
 
     Attributes:
-        waiting: in the order of arrival.
-        dropped: number of images that were dropped.
-        stamps_ns: of the newest of these.
+        waiting: messages in the order of arrival.
+        dropped: number of images dropped since the last call.
+        stamps_ns: stamps of the newest dropped images.
     """
 
     waiting: tuple[Waiting, ...]
@@ -101,12 +101,13 @@ class Arrived(NamedTuple):
 
 
 class InputQueue:
-    """First in, first out, between threads.
+    """First-in-first-out queue between threads.
 
     Args:
-        limits: most that may wait, by source or by kind of source; others have no limit.
-        counted: the kind of source whose dropped members are counted.
-        changed: is notified when something comes; its lock guards the queue.
+        limits: maximum number of waiting messages by source or kind of source; others are
+            unlimited.
+        counted: kind of source whose dropped messages are counted.
+        changed: notified on each arrival; its lock guards the queue.
     """
 
     def __init__(
@@ -122,12 +123,12 @@ class InputQueue:
         self._changed = changed or threading.Condition()
 
     def limit(self, source: str, most: int) -> None:
-        """Changes how many of a source, or of each of a kind, may wait."""
+        """Sets the maximum number of waiting messages of a source, or of each of a kind."""
         with self._changed:
             self._limits[source] = most
 
     def put(self, waiting: Waiting) -> None:
-        """Adds something; drops the oldest of its source where there are too many."""
+        """Adds a message or request; drops the oldest of its source above the limit."""
         source = waiting.source
         with self._changed:
             if self._closed:
@@ -146,7 +147,7 @@ class InputQueue:
             self._changed.notify_all()
 
     def take(self, most: int | None = None) -> Arrived:
-        """Takes out what is there, or the first of it."""
+        """Takes out all messages, or the first `most`."""
         with self._changed:
             count = len(self._waiting) if most is None else min(most, len(self._waiting))
             taken = tuple(self._waiting.popleft() for _ in range(count))
@@ -157,14 +158,14 @@ class InputQueue:
             return result
 
     def close(self) -> Arrived:
-        """Takes nothing in any more; returns what waits."""
+        """Closes the queue to new messages; returns those that wait."""
         with self._changed:
             self._closed = True
             return self.take()
 
     @property
     def since(self) -> float:
-        """When the oldest that waits came; infinity where nothing waits."""
+        """Arrival time of the oldest waiting message, s; infinity if none waits."""
         with self._changed:
             return self._waiting[0].arrival if self._waiting else math.inf
 
@@ -174,24 +175,24 @@ class InputQueue:
 
 
 class EstimatingThread:
-    """Gives sessions their turns, while it serves some.
+    """A thread that gives turns to the estimators that it serves.
 
-    All methods may be called by any thread but this one.
+    The public methods are for all other threads.
 
     Args:
-        changed: of all threads of the process, and of the queues of those whom they serve.
-        after: a thread that has work to do before this one.
+        changed: condition shared by all estimating threads of the process and their queues.
+        after: thread of higher priority.
     """
 
     def __init__(self, changed: threading.Condition, after: EstimatingThread | None = None) -> None:
         self.changed, self._after = changed, after
         self._served: list[Estimator] = []
-        # Whose turn it is.
+        # The estimator whose turn it is.
         self._busy: Estimator | None = None
         self._thread: threading.Thread | None = None
 
     def serve(self, estimator: Estimator) -> None:
-        """Begins to give turns to somebody."""
+        """Starts to give turns to an estimator."""
         with self.changed:
             self._served.append(estimator)
             self._served.sort(key=lambda one: one.place)
@@ -200,7 +201,7 @@ class EstimatingThread:
                 self._thread.start()
 
     def leave(self, estimator: Estimator, timeout: float | None) -> bool:
-        """Gives somebody no more turns; returns whether the present one ends within `timeout` s."""
+        """Gives no more turns to an estimator; returns whether its turn ends within `timeout` s."""
         with self.changed:
             if estimator in self._served:
                 self._served.remove(estimator)
@@ -214,7 +215,7 @@ class EstimatingThread:
             estimator.handle(estimator.queue.take(None if self._after is None else 1))
 
     def _next(self, last: int) -> Estimator | None:
-        """Whose turn it is after that of a place, once something waits; None: nobody is served."""
+        """Waits for the next estimator with work after a place; None if none is served."""
         with self.changed:
             self._busy = None
             self.changed.notify_all()
@@ -234,12 +235,12 @@ class EstimatingThread:
 
 
 class EstimatingThreads:
-    """The threads of a process.
+    """The estimating threads of a process.
 
     Attributes:
-        poses: for what leads to the pose.
-        later: for what can wait for it.
-        seen_images: that the filter keeps for the smoother.
+        poses: thread of the sessions that contribute to the pose.
+        later: thread of the sessions that can wait for the pose.
+        seen_images: images that the filter keeps for the smoother.
     """
 
     def __init__(self) -> None:
@@ -250,7 +251,7 @@ class EstimatingThreads:
         self._pictures: deque[tuple[Any, Image]] = deque(maxlen=SHARED)
 
     def decode(self, message: Any) -> Image:
-        """The picture of an image, as `decode_image`; decoded once for all sessions."""
+        """The pixels of an image message, see `decode_image`; decoded once for all sessions."""
         for known, picture in tuple(self._pictures):
             if known is message:
                 return picture
@@ -260,17 +261,17 @@ class EstimatingThreads:
 
 
 class Estimator:
-    """Handles the messages of a session, up to the report on each.
+    """Handles the messages of a session, and reports on each.
 
     All methods but `handle` may be called by any thread.
 
     Args:
-        session: used by the thread alone, until `stop` has returned True.
+        session: used only by the thread, until `stop` has returned True.
         thread: that gives it its turns.
-        place: of its turns among those of others.
-        tell: takes the report on each message.
+        place: position of its turns among those of others.
+        tell: receives the report on each message.
         tell_change: called when status or kinds of faults of the session have changed.
-        tell_error: takes an error that the session should not have raised; names it in a line.
+        tell_error: receives an unexpected error of the session; returns a line that names it.
 
     Attributes:
         queue: messages and requests that wait.
@@ -288,7 +289,7 @@ class Estimator:
     ) -> None:
         self._session, self._thread = session, thread
         self.place = place
-        # The last of several requests to start anew counts.
+        # Of several requests to restart, the last one counts.
         limits = {_RESTART: 1, session.COUNTED: session.most_waiting}
         self.queue = InputQueue(limits, session.COUNTED, thread.changed)
         session.interrupted = lambda: bool(len(self.queue))
@@ -298,16 +299,16 @@ class Estimator:
         thread.serve(self)
 
     def listen(self, one: SubscribedTopic) -> None:
-        """Adds a topic that messages come from."""
+        """Sets the queue limit of a subscribed topic."""
         if kind_of(one.source) != self._session.COUNTED:
             self.queue.limit(one.source, one.waiting)
 
     def restart(self, action: Callable[[], None]) -> None:
-        """Restarts the session by an action, after the messages that have come before."""
+        """Restarts the session by an action, after all messages that wait."""
         self.queue.put(Waiting(_RESTART, action, time.monotonic()))
 
     def take_limit(self) -> None:
-        """Takes from the session how many images or mixtures may wait."""
+        """Updates the maximum number of waiting images or mixtures from the session."""
         self.queue.limit(self._session.COUNTED, self._session.most_waiting)
 
     def take_durations(self) -> list[Duration]:
@@ -315,10 +316,10 @@ class Estimator:
         return [self._durations.popleft() for _ in range(len(self._durations))]
 
     def stop(self, timeout: float | None = None) -> bool:
-        """Ends after the present turn; drops waiting messages, but does a restart.
+        """Stops after the present turn; drops waiting messages, but executes a waiting restart.
 
         Returns:
-            Whether it has ended within `timeout` s.
+            Whether it stopped within `timeout` s.
         """
         left = self.queue.close()
         if not self._thread.leave(self, timeout):
@@ -331,7 +332,7 @@ class Estimator:
         return True
 
     def handle(self, arrived: Arrived) -> None:
-        """Handles what has come; for the thread."""
+        """Handles messages and reports dropped images; only the thread calls this."""
         session = self._session
         session.count_dropped(arrived.dropped - len(arrived.stamps_ns))
         for stamp in arrived.stamps_ns:
@@ -346,7 +347,7 @@ class Estimator:
         try:
             self._handle(waiting, more=more)
         except Exception as error:  # noqa: BLE001
-            # A fault of ours: later messages must not suffer from it.
+            # An internal error must not affect later messages.
             text = f'the node itself failed: {self._tell_error(error)}'
             self._tell(session.break_off(waiting.source, text))
         after = session.state
@@ -366,13 +367,13 @@ class Estimator:
         try:
             message = waiting.content()
         except Exception as error:  # noqa: BLE001
-            # Bytes from outside meet generated code here, which does not say what it may raise.
+            # Generated code reads external bytes here, and may raise any exception.
             handled = session.refuse(waiting.source, error_line(error), more=more)
         else:
             handled = session.take(waiting.source, message, more=more)
         if more_done := session.state.counts[session.DONE] - done:
-            # An image may have waited for this message, which came later.
-            # Forecasts are of times to come.
+            # Latency counts from the image, which may have waited for this message. Stamps of
+            # forecasts are in the future.
             stamps = (stamp for topic, stamp in handled.published if 'forecast' not in topic)
             newest = max(stamps, default=0)
             arrival = self._arrivals.get(newest, waiting.arrival)

@@ -1,7 +1,7 @@
 """hri_node: mixtures of people in, the topics and frames of REP 155 out; around a session.
 
-Bodies come and go, and their topics with them. People do as well: four times a second the node
-looks for mixtures in namespaces that it does not know yet, and leaves those that are gone.
+Topics of a body exist as long as the body. Four times a second the node subscribes to mixtures of
+people in new namespaces, and unsubscribes from topics without a publisher.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from msg_tools.messages.humans import IDS
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
 _URDF = 'urdf'
-# Subscriptions at a time to people who come by themselves, and period of the search for them, s.
+# Maximum number of subscribed topics, and period of the search for people, s.
 _MOST_TOPICS = 64
 _SEARCH = 0.25
 
@@ -46,7 +46,7 @@ _SEARCH = 0.25
 class HriNode(SessionNode[HriSession, HriParameters]):
     """The node; its parameters are the fields of `HriParameters`.
 
-    It declares a parameter `human_description_<id>` with the URDF of each body, as REP 155 asks.
+    It declares a parameter `human_description_<id>` with the URDF of each body (REP 155).
     """
 
     NAME = 'hri_node'
@@ -56,7 +56,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
-        # Publishers of bodies, by topic. They belong to the thread that estimates.
+        # Publishers of bodies, by topic. Only the estimating thread uses them.
         self._of_bodies: dict[str, Any] = {}
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._search = self.create_timer(_SEARCH, self._look_for_people, clock=steady)
@@ -73,19 +73,19 @@ class HriNode(SessionNode[HriSession, HriParameters]):
             yield self._mixtures_in(namespace)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Listens."""
+        """Subscribes to the inputs and searches for people."""
         result = super().on_activate(state)
         self._look_for_people()
         return result
 
-    # People come and go.
+    # Subscriptions to people.
 
     def _mixtures_in(self, namespace: str) -> SubscribedTopic:
         topic = f'{namespace.rstrip("/")}/{self._settings.mixture_topic}'
         return mixture_topic(mixture_source(namespace), topic)
 
     def _found(self) -> list[str]:
-        """Namespaces below /humans/bodies in which somebody publishes mixtures."""
+        """Namespaces below /humans/bodies with published mixtures."""
         end = f'/{self._settings.mixture_topic}'
         return sorted(
             topic.removesuffix(end)
@@ -114,7 +114,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
             self._subscribe(one)
             self.get_logger().info(f'mixtures from {one.topic}')
 
-    # Bodies come and go; called by the thread that estimates.
+    # Publishers of bodies; called by the estimating thread.
 
     def _publisher_of(self, topic: str) -> Any:
         if topic in self._outputs:
@@ -125,7 +125,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
                 message_class(msgtype),
                 topic,
                 qos,
-                # Handlers of events would belong to the executor's thread.
+                # The executor's thread would call event handlers.
                 event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
             )
         return self._of_bodies[topic]
@@ -150,7 +150,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
         self._forget_bodies(set() if session is None else session.identities)
 
     def _forget_bodies(self, kept: set[str]) -> None:
-        """Ends the topics and parameters of bodies that are not there any more."""
+        """Deletes the topics and parameters of bodies that are gone."""
         for topic in list(self._of_bodies):
             identity, _, name = topic.removeprefix(f'{BODIES}/').partition('/')
             if identity in kept:

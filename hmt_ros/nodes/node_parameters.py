@@ -1,4 +1,4 @@
-"""Parameters of a node as ROS has them: how they are declared, and which were given in vain."""
+"""ROS parameters of a node: declaration, and warnings of ineffective values."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from hmt_ros.sessions.parameter_file import LARGEST_FILE, PARAMETERS_KEY
 from msg_tools.files.plain_yaml import read_plain_yaml
 
 QOS_OVERRIDES = 'qos_overrides.'
-# Least likeness of a name to the one that is meant; more for nodes, as their names are alike.
+# Least similarity of a name to a suggested one; larger for nodes, whose names are alike.
 _ALIKE, _ALIKE_NODE = 0.5, 0.8
 
 
@@ -45,10 +45,10 @@ def declare(node: Node, defaults: Settings) -> Settings:
         defaults: their default values.
 
     Returns:
-        The values that the node was given.
+        The values given to the node.
 
     Raises:
-        ValueError: values that do not go together.
+        ValueError: inconsistent values.
     """
     declared = declared_parameters(defaults)
     as_in_ros = values_of(defaults)
@@ -57,17 +57,17 @@ def declare(node: Node, defaults: Settings) -> Settings:
     settings = with_values(defaults, values)
     lists = {p.name for p in declared if isinstance(p.default, tuple)}
     node.add_pre_set_parameters_callback(partial(with_empty_lists, names=lists))
-    # An empty list of a parameter file has come as no value, too.
+    # ROS passes an empty list of a parameter file as no value, too.
     node.set_parameters([Parameter(name) for name in lists if values[name] is None])
     return settings
 
 
 def descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:
-    """How a parameter is declared to ROS: description, limits, whether it can change."""
+    """The ROS descriptor of a parameter: description, limits, whether it can change."""
     result = ParameterDescriptor(
         description=f'{parameter.description} {EFFECTS[parameter.effect]}',
         read_only=parameter.effect == AT_LAUNCH,
-        # ROS gives an empty list, and one of whole numbers, another type than one of numbers.
+        # In ROS an empty list and a list of integers have other types than a list of floats.
         dynamic_typing=isinstance(parameter.default, tuple),
     )
     if parameter.limits is not None:
@@ -82,12 +82,12 @@ def descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:
 
 
 def with_empty_lists(parameters: Iterable[Parameter], names: Set[str]) -> list[Parameter]:
-    """Parameters that are to be set, an empty list in the place of no value.
+    """Parameters to set, where list parameters without a value get an empty list.
 
-    ROS tools write an empty list as no value, and rclpy takes away a parameter that has none.
+    ROS tools write an empty list as no value, and rclpy would delete a parameter without a value.
 
     Args:
-        names: of those that are lists of numbers.
+        names: of the parameters that are lists of numbers.
     """
     return [
         Parameter(one.name, Parameter.Type.DOUBLE_ARRAY, [])
@@ -98,10 +98,10 @@ def with_empty_lists(parameters: Iterable[Parameter], names: Set[str]) -> list[P
 
 
 def refuse(response: Any, asked: int, reason: str) -> None:
-    """Fills the answer to a request that can not be served.
+    """Fills the response to a refused request.
 
     Args:
-        asked: number of parameters that were to be set.
+        asked: number of parameters that the request sets.
     """
     refused = SetParametersResult(successful=False, reason=reason)
     if hasattr(response, 'results'):
@@ -114,7 +114,7 @@ def refuse(response: Any, asked: int, reason: str) -> None:
 
 
 def unknown_parameters(given: Iterable[str], known: Iterable[str]) -> list[str]:
-    """Warnings of names that a node was given and does not have.
+    """Warnings of unknown parameter names, with suggestions.
 
     Args:
         given: names from the command line and from parameter files.
@@ -129,29 +129,29 @@ def unknown_parameters(given: Iterable[str], known: Iterable[str]) -> list[str]:
 
 
 def file_folders(given: str) -> tuple[str, ...]:
-    """The folders in which files may lie that parameters name while a node runs.
+    """Folders of the files that parameters of a running node may name.
 
     Args:
-        given: the parameter of this name.
+        given: the parameter `file_folders`.
     """
     usual = []
     for find in (partial(get_package_share_directory, 'hmt_ros'), Path.home, Path.cwd):
-        # Any of them may be missing.
+        # Any of these folders may be missing.
         with suppress(PackageNotFoundError, RuntimeError, OSError):
             usual.append(str(find()))
-    # A service without a home, or one that works in the root, must not open all files.
+    # A service whose home or working folder is the root must not open all files.
     named = given.split(':') if given else [folder for folder in usual if folder != '/']
     return tuple(dict.fromkeys(filter(None, named)))
 
 
 def next_step(node: Node) -> str:
-    """Advice after a configuration that failed."""
+    """Advice after a failed configuration."""
     change = f'ros2 lifecycle set {node.get_fully_qualified_name()}'
     return f'mend that, then: {change} configure; {change} activate'
 
 
 def files_for_others(arguments: Iterable[str], node: str) -> list[str]:
-    """Warnings of parameter files in which a node is not named as it is called.
+    """Warnings of parameter files whose section has a similar name, but not that of the node.
 
     A file for other nodes gives no warning: one file may serve many nodes.
 
@@ -165,7 +165,7 @@ def files_for_others(arguments: Iterable[str], node: str) -> list[str]:
         try:
             document = read_plain_yaml(Path(path), LARGEST_FILE)
         except ValueError:
-            # ROS has read it: it is no plain YAML, but nothing is wrong with it.
+            # ROS accepted this file, which is valid YAML beyond the plain subset.
             continue
         sections = list(_sections(document, '')) if isinstance(document, Mapping) else []
         if any(re.fullmatch(_pattern(section), node) for section in sections):
@@ -182,7 +182,7 @@ def files_for_others(arguments: Iterable[str], node: str) -> list[str]:
 
 
 def _sections(document: Mapping[Any, Any], prefix: str) -> Iterator[str]:
-    """Names of the nodes that a parameter file is for, with namespaces."""
+    """Names, with namespaces, of the nodes with a section in a parameter file."""
     for key, value in document.items():
         name = f'{prefix}/{str(key).strip("/")}'
         if key == PARAMETERS_KEY:
@@ -192,6 +192,6 @@ def _sections(document: Mapping[Any, Any], prefix: str) -> Iterator[str]:
 
 
 def _pattern(section: str) -> str:
-    """Regular expression over full names of nodes that a section matches."""
+    """Regular expression for the full names of the nodes of a section."""
     parts = {'*': '/[^/]+', '**': '(/[^/]+)*'}
     return ''.join(parts.get(part, f'/{re.escape(part)}') for part in section.split('/')[1:])

@@ -1,7 +1,7 @@
-"""Files that parameters name are read by a thread of their own, for which a node waits shortly.
+"""Reads files that parameters name in a separate thread, for which a node waits only shortly.
 
-A reader in Python can not be stopped. One that takes longer goes on, alone, and who asks again gets
-its result.
+A Python thread can not be stopped. A slow reader continues in the background, and a repeated
+request gets its result.
 """
 
 from __future__ import annotations
@@ -12,36 +12,36 @@ from concurrent.futures import Future, wait
 from threading import Thread
 from typing import Any
 
-# Longest time that a node waits for a reader, s, and largest share of its time that it waits: many
-# questions must not keep it from all else.
+# Longest time that a node waits for a reader, s, and largest share of its time, so that many
+# requests do not block it.
 LONGEST_WAIT, SHARE = 0.6, 0.5
 _GLANCE = 0.01
 
 
 class PatientReader:
-    """Reads for one who asks at a time; all methods are for one thread."""
+    """Reads for one request at a time; not thread-safe."""
 
     def __init__(self) -> None:
-        # What is asked for, and its result.
+        # The present request and its result.
         self._asked: tuple[Any, Future[None]] | None = None
-        # Time that the node may wait, s, and when that was known.
+        # Remaining time that the node may wait, s, and the time of its last update, s.
         self._left, self._since = LONGEST_WAIT, time.monotonic()
 
     def read(self, of: Any, action: Callable[[], Any], meanwhile: Callable[[], None]) -> None:
         """Reads files.
 
         Args:
-            of: what is asked for; equal to that of a question that is asked again.
-            action: reads them.
-            meanwhile: called while others wait.
+            of: identifies the request; a repeated request has an equal value.
+            action: reads the files.
+            meanwhile: called repeatedly during the wait.
 
         Raises:
-            ValueError: others are being read, or these are not read yet; one line.
+            ValueError: other files are being read, or these are not read yet; one line.
             Exception: of the action.
         """
         if self._asked is None or (self._asked[0] != of and self._asked[1].done()):
             self._asked = of, Future()
-            # Not of a pool: the process would wait for it at its end.
+            # Not a pool, whose threads the process would join at its end.
             Thread(target=_do, args=(action, self._asked[1]), name='read', daemon=True).start()
         asked, result = self._asked
         if asked != of:
@@ -63,5 +63,5 @@ def _do(action: Callable[[], Any], result: Future[None]) -> None:
         action()
         result.set_result(None)
     except Exception as error:  # noqa: BLE001
-        # Raised where the result is asked for.
+        # `Future.result` raises it.
         result.set_exception(error)

@@ -1,6 +1,7 @@
 """people_node: images and detections of several people in, mixtures over the poses of each out.
 
-The topics of a person are opened when the person is first seen, and closed some seconds after.
+The topics of a person open when the person is first seen, and close some seconds after the person
+has left.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from hmt_ros.sessions.track import person_of
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from hmt_ros.sessions.tracking_parameters import PeopleParameters
 
-# Periods of the diagnostics after which the topics of somebody who has left are closed: the last
-# messages are still on their way.
+# Number of diagnostics periods from the end of a track until the topics of the person close: the
+# last messages must still arrive.
 STAYS_OPEN = 5
 
 
@@ -35,13 +36,13 @@ class PeopleNode(TrackingNode):
     DEFAULTS = PeopleParameters()
 
     def __init__(self, *args: Any, **options: Any) -> None:
-        # The thread that estimates opens and uses topics, that of the executor closes them.
+        # The estimating thread opens and uses topics, the executor's thread closes them.
         self._opening = threading.RLock()
         self._left: dict[str, int] = {}
         super().__init__(*args, **options)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Listens no more; the topics of all people are closed."""
+        """Unsubscribes and stops the estimator; closes the topics of all people."""
         result = super().on_deactivate(state)
         self._close_topics({name for topic in self._outputs if (name := person_of(topic))})
         return result
@@ -51,7 +52,7 @@ class PeopleNode(TrackingNode):
             raise ValueError('a mixture or a box is of one person: wanted an empty request')
         return prepare_start(self._settings)
 
-    # Called by the thread that estimates.
+    # Called by the estimating thread.
 
     def _publish(self, output: Output) -> None:
         with self._opening:
@@ -68,10 +69,10 @@ class PeopleNode(TrackingNode):
         if topic not in self._outputs:
             publisher = self._new_publisher(topic, *published_with(published_topic(topic)))
             publisher.on_activate(None)
-            # Others may be going through the old ones.
+            # A copy, because another thread may iterate over the old dictionary.
             self._outputs = {**self._outputs, topic: publisher}
 
-    # Called by the thread of the executor.
+    # Called by the executor's thread.
 
     def _diagnose_period(self) -> None:
         super()._diagnose_period()

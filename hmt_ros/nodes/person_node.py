@@ -1,10 +1,10 @@
 """person_node: filter, smoother, experts and a detector in one process.
 
-The nodes are the same as in processes of their own: names, parameters, topics, services and bytes.
-One thread calls the sessions in the order in which they use each other's results, detector, experts
-and filter, and one the smoother, when no image waits (`hmt_ros.nodes.estimating_thread`). Images
-come in once, and the libraries are in memory once. Names on the command line select the nodes; by
-the defaults of their parameters they use each other's results.
+The nodes have the same names, parameters, topics, services and messages as in separate processes.
+One thread calls detector, experts and filter, in the order in which they use each other's results,
+and another calls the smoother when no image waits (`hmt_ros.nodes.estimating_thread`). Images are
+received once, and the libraries are loaded once. Names on the command line select the nodes; by
+default they use each other's results.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ The filter uses the predictions of bme_node, and the keypoints of a detector, wh
 
 
 def used_of_each_other(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Parameters by node that follow from the nodes that run together."""
+    """Parameters, by node, by which nodes that run together use each other's results."""
     values: dict[str, dict[str, Any]] = {name: {} for name in names}
     if FilterNode.NAME in names:
         used = {
@@ -53,16 +53,16 @@ def used_of_each_other(names: Sequence[str]) -> dict[str, dict[str, Any]]:
         }
         values[FilterNode.NAME] = {name: use for name, use in used.items() if use}
         if BmeNode.NAME in names:
-            # While the person is tracked the filter needs the processor more.
+            # While the person is tracked, the filter needs the processor more.
             values[BmeNode.NAME] = {'tracked_interval': TRACKED_INTERVAL}
     return values
 
 
 def nodes_together(names: Sequence[str], **options: Any) -> list[SessionNode[Any, Any]]:
-    """Nodes that share a thread and their messages, in the order of their turns.
+    """Nodes that share threads and messages, in the order of their turns.
 
     Args:
-        options: of all of them, see `SessionNode`.
+        options: of all nodes, see `SessionNode`.
     """
     values = used_of_each_other(names)
     nodes: list[SessionNode[Any, Any]] = []

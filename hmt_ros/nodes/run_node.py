@@ -1,6 +1,6 @@
-"""Runs a node, or several together, in a process of their own, until a signal stops it.
+"""Runs one or several nodes in this process until a signal stops it.
 
-With --help it prints how a node is run, and its parameters.
+With --help it prints the usage and the parameters of a node.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from hmt_ros.sessions.declared_parameters import DeclaredParameter, declared_par
 from hmt_ros.sessions.parameter_file import yaml_scalar
 from msg_tools.files.error_line import error_line
 
-# Environment variable with the id of the process without which a node ends.
+# Environment variable with the id of the parent process; a node ends with it.
 OWNER = 'HMT_ROS_OWNER'
 
-# Parameter of mallopt(3): the largest number of heaps.
+# Parameter of mallopt(3) for the maximum number of heaps.
 _ARENA_MAX = -8
-# Time after which Python's lock passes to a thread that waits for it, s. By default it is 5 ms: a
-# step would wait so long at each call of compiled code beside a thread that is busy.
+# Time after which a thread yields Python's lock to another, s. With the default of 5 ms, beside a
+# busy thread, a step would wait as long after each call of compiled code.
 _SWITCH_INTERVAL = 0.0005
-# Time for a last estimate at the end, s.
+# Time limit for the last estimate at the end, s.
 _LAST_ESTIMATE = 5.0
 _WIDTH = 100
 _TYPES = {bool: 'bool', int: 'int', float: 'float', str: 'string', tuple: 'list of floats'}
@@ -56,14 +56,14 @@ def run_together(
     """Runs nodes in this process until a signal stops it; returns 0, or 1 if one could not start.
 
     Args:
-        make: the nodes, once ROS is there.
+        make: makes the nodes, after ROS is initialised.
         arguments: of the command line, for ROS.
     """
     _use_one_heap()
-    # OpenCV's own threads wait actively: on images of a camera they cost more than they save.
+    # OpenCV's threads wait actively; on camera images they cost more than they save.
     cv2.setNumThreads(1)
     sys.setswitchinterval(_SWITCH_INTERVAL)
-    # The handlers of rclpy end the context in the middle of the work; ours let the work finish.
+    # The handlers of rclpy would end the context during work; these let the work finish.
     stopped = threading.Event()
     on_signals(lambda *_: stopped.set())
     try:
@@ -80,7 +80,7 @@ def run_together(
             node.get_logger().warn(text)
     for node in nodes:
         node.start()
-    # A process that started a node and was killed can not end it any more.
+    # If the parent process is killed, it can not stop the node, which then ends by itself.
     owner = os.environ.get(OWNER)
     while not stopped.is_set() and owner in (None, str(os.getppid())):
         _spin_once(executor, nodes)
@@ -97,19 +97,19 @@ def run_together(
 
 
 def _use_one_heap() -> None:
-    """Makes all threads allocate from one heap, where the C library has the choice.
+    """Makes all threads allocate from one heap, if the C library supports it.
 
-    Image buffers go from thread to thread, and a heap for each thread breaks into pieces by it: the
-    process grows as long as it runs. Python's lock leaves threads little to wait for.
+    Image buffers pass from thread to thread, which fragments a heap per thread, so that the process
+    would keep growing. Under Python's lock, threads hardly wait for the one heap.
     """
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)
 
 
 def _new_executor() -> Executor:
-    """An executor that does not look through all topics of all nodes for each message.
+    """An events executor, which does not search all topics of all nodes for each message.
 
-    A camera gets a quarter more answers by it. The first releases of Jazzy do not have it.
+    With it a camera gets a quarter more answers. The first releases of Jazzy lack it.
     """
     try:
         from rclpy.experimental import EventsExecutor
@@ -120,21 +120,21 @@ def _new_executor() -> Executor:
 
 def _spin_once(executor: Executor, nodes: Sequence[SessionNode[Any, Any]]) -> None:
     try:
-        # A signal does not wake a thread that waits for messages.
+        # A timeout, because a signal does not wake a thread that waits for messages.
         executor.spin_once(timeout_sec=0.2)
     except Exception as error:  # noqa: BLE001
-        # rclpy itself raises where /clock goes below zero, for example: the node lives.
+        # The node survives errors of rclpy, for example if /clock is negative.
         text = f'{type(error).__name__}: {error_line(error)}'
         nodes[0].get_logger().error(f'a callback failed: {text}', throttle_duration_sec=1.0)
-        # Messages that came together with this one would stay unread: unread messages are
-        # counted anew.
+        # Messages that arrived together with this one would stay unread; adding the nodes again
+        # makes the executor count them.
         for node in nodes:
             executor.remove_node(node)
             executor.add_node(node)
 
 
 def wants_help(arguments: Iterable[str]) -> bool:
-    """Whether a command line asks for help, before --ros-args or behind."""
+    """Whether a command line asks for help, before or after --ros-args."""
     return any(word in ('-h', '--help') for word in arguments)
 
 

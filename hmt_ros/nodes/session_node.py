@@ -1,14 +1,14 @@
 """A lifecycle node around a session: messages in, messages out, one thread that estimates.
 
-The executor's thread only puts messages into a queue and answers services; one other thread
-estimates. Messages pass the middleware as bytes: the same code as offline reads and writes the
-bytes of a bag or a wire.
+The executor's thread only queues messages and answers services; another thread estimates.
+Messages pass the middleware as bytes, so that nodes and offline commands read and write them with
+the same code.
 
-Nodes of one process share their threads. A message of one goes to the others as it is, and a topic
-of other processes is subscribed to once, by the first node that listens.
+Nodes of one process share their threads. They pass messages to each other unserialised, and the
+first node that listens to a topic of another process subscribes to it for all.
 
-`~/handled` (hmt_msgs/Handled) reports on every message that was received, after all that it led to
-has been published. A player that waits for it feeds the node in lock step.
+`~/handled` (hmt_msgs/Handled) reports every received message, once all its results are published.
+A player that waits for this report runs in lock step with the node.
 """
 
 from __future__ import annotations
@@ -72,11 +72,11 @@ from msg_tools.messages.cdr import serialise
 
 AnySession = TypeVar('AnySession', bound=Session[Any, Any])
 Parameters = TypeVar('Parameters', bound=NodeParameters)
-# Periods of the diagnostics between two lines on the console that tell of the same status.
+# Number of diagnostics periods between two console lines with the same status.
 QUIET_PERIODS = 10
-# Time for which the diagnostics tell of a clock that went back, s.
+# Time for which the diagnostics report a backward jump of the clock, s.
 ALARM = 5.0
-# Parameters that one request may set; each takes a part of a millisecond.
+# Maximum number of parameters in one request; each takes a fraction of a millisecond.
 MOST_PARAMETERS = 256
 
 
@@ -85,7 +85,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
 
     Args:
         defaults: of the parameters; None: those of the class.
-        beside: another node of this process; None: it has none yet.
+        beside: another node of this process; None: this is the first.
         options: of `rclpy.lifecycle.LifecycleNode`.
 
     Attributes:
@@ -93,12 +93,12 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         SUBJECT: subject of the diagnostics.
         SESSION: class of the session.
         DEFAULTS: parameters with their default values.
-        CAN_WAIT: whether its results can wait for those of other nodes of the process.
+        CAN_WAIT: whether the node may work after the other nodes of the process.
     """
 
     NAME: ClassVar[str]
     SUBJECT: ClassVar[str]
-    # Of the types of the class, which a class variable can not name.
+    # Their types are type variables of the class, which a ClassVar can not use.
     SESSION: ClassVar[Any]
     DEFAULTS: ClassVar[Any]
     CAN_WAIT: ClassVar[bool] = False
@@ -112,10 +112,10 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         super().__init__(self.NAME, **options)
         defaults = self._in_namespace(self.DEFAULTS if defaults is None else defaults)
         if self.get_parameter('use_sim_time').value:
-            # A bag that is played again.
+            # A bag may be played repeatedly.
             defaults = replace(defaults, reset_on_time_jump=True)
         self._settings: Parameters = declare(self, defaults)
-        # What was given at launch may name any file.
+        # Only parameters that were set at launch may name files anywhere.
         self._at_launch = self._settings
         self._folders = file_folders(self._settings.file_folders)
         self._reader = PatientReader()
@@ -137,16 +137,16 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._local_names: dict[str, str] = {}
         offered = (topic for topic in self._offered_topics() if not topic.startswith('/'))
         self._offered_names = {self._local_name(topic) for topic in offered}
-        # Topics that are listened to, by their names in this process, and own subscriptions.
+        # Inputs of this node, and subscriptions that it owns, by topic name in this process.
         self._heard: dict[str, SubscribedTopic] = {}
         self._connected: dict[str, Any] = {}
         self._nodes.append(self)
-        # On topics that the node both publishes and subscribes to.
+        # Sent messages on topics that the node also subscribes to.
         self._own = OwnMessages()
         self._failure = ''
-        # What a step back of the clock has led to, and when that was told first.
+        # Effect of a backward jump of the clock, and time of its first report, s.
         self._jump = '', 0.0
-        # Errors of the node itself.
+        # Count and text of the node's internal errors.
         self._errors, self._last_error = 0, ''
         self._told_at = self._untold = 0
         self._told_status = ''
@@ -159,14 +159,14 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             RELIABLE,
             event_callbacks=self._events.of_publisher('/diagnostics'),
         )
-        # With use_sim_time and without a clock, diagnostics are needed most.
+        # Diagnostics must also run with use_sim_time when nobody publishes a clock.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(1.0, self._diagnose_period, clock=steady)
 
-    # Choices of each node.
+    # Overridden by each node.
 
     def _offered_topics(self) -> Iterable[str]:
-        """Topics that nodes of this process get from this node and nobody else."""
+        """Topics that nodes of this process receive from this node only."""
         return self.SESSION.TOPICS
 
     def _in_namespace(self, defaults: Any) -> Any:
@@ -182,27 +182,27 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         """The topics to subscribe to, the one that sets the pace last."""
 
     def _messages_of_others(self, settings: Parameters) -> Mapping[str, str]:
-        """Types of messages of packages that need not be installed, each with its consumer.
+        """Message types of optional packages, each with its consumer.
 
         Raises:
-            ValueError: none of those that would do is installed.
+            ValueError: no suitable package is installed.
         """
         return {}
 
     # Common to all nodes.
 
     def start(self) -> None:
-        """Configures and activates the node, unless it is to wait for its services."""
+        """Configures and activates the node, unless `autostart` is off."""
         if not self._settings.autostart:
             return
         if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
             self.trigger_activate()
 
     def stop(self, timeout: float | None = None) -> bool:
-        """Ends the thread that estimates, after its present message.
+        """Stops the estimator after its present message.
 
         Returns:
-            Whether it has ended within `timeout` s.
+            Whether it stopped within `timeout` s.
         """
         if self._estimator is not None and not self._estimator.stop(timeout):
             return False
@@ -213,7 +213,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         """A session with these parameters.
 
         Raises:
-            ValueError: they name something that can not be used, or that is not installed.
+            ValueError: a parameter names something unusable or not installed.
         """
         for msgtype, needed_by in self._messages_of_others(settings).items():
             read_installed_messages(msgtype, needed_by)
@@ -223,10 +223,10 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return session
 
     def _answer(self, response: Any, field: str, make: Callable[[AnySession], Any]) -> Any:
-        """A response with the message that a session makes in a field.
+        """Fills a field of a response with a message that the session makes.
 
         Raises:
-            ValueError: there is none.
+            ValueError: there is no session.
         """
         if self._session is None:
             raise ValueError('the node is not configured')
@@ -244,7 +244,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     # Lifecycle.
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Reads files, opens topics."""
+        """Creates the session, its publishers and services."""
         try:
             session = self._new_session(self._settings, self._publish, self._is_wanted)
         except ValueError as error:
@@ -265,7 +265,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Listens."""
+        """Subscribes to the inputs and starts the estimator."""
         assert self._session is not None
         session, inputs = self._session, list(self._wanted_inputs())
         result = super().on_activate(state)
@@ -288,7 +288,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Listens no more."""
+        """Unsubscribes and stops the estimator."""
         self._unsubscribe()
         self.stop()
         if self._session is not None:
@@ -296,7 +296,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Forgets the estimate, closes topics; also at shutdown and after an error."""
+        """Deletes the session and closes topics; also at shutdown and after an error."""
         self._close()
         return super().on_cleanup(state)
 
@@ -310,7 +310,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._connect(name)
 
     def _connect(self, name: str) -> None:
-        """Subscribes to a topic, unless it is one of this process or has come into it already."""
+        """Subscribes to a topic, unless a node of this process offers it or subscribes to it."""
         if any(name in one._offered_names or name in one._connected for one in self._nodes):
             return
         wanted = self._heard[name]
@@ -332,7 +332,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         )
 
     def _leave(self, name: str) -> None:
-        """Listens to a topic no more; another node of the process takes the subscription over."""
+        """Leaves a topic; another node of the process that listens subscribes instead."""
         del self._heard[name]
         if (subscription := self._connected.pop(name, None)) is None:
             return
@@ -345,7 +345,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return [one for one in self._nodes if name in one._heard]
 
     def _hear(self, name: str, waiting: Waiting) -> None:
-        """Takes a message on a topic; for any thread."""
+        """Queues a message on a topic; any thread may call this."""
         wanted, estimator = self._heard.get(name), self._estimator
         if wanted is not None and estimator is not None:
             self._silent.arrived(wanted.source, waiting.arrival)
@@ -369,11 +369,11 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             self.destroy_service(service)
         self._offered.clear()
         self._session = None
-        # Sessions and their tracks are in cycles, and hold images: Python would wait for long.
+        # Sessions are in reference cycles with images; Python would free them much later.
         gc.collect()
 
     def _serve(self, callback: Callable[..., Any], request: Any, response: Any) -> Any:
-        """Answers a request, whatever it holds; one that can not be served is refused."""
+        """Answers a request; refuses it, with a reason, if it fails."""
         asked = getattr(request, 'parameters', ())
         try:
             if len(asked) > MOST_PARAMETERS:
@@ -392,10 +392,10 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     # Parameters.
 
     def _warn_of_unknown(self, *, qos: bool) -> None:
-        """Warns of values for parameters that the node does not have.
+        """Warns about values of parameters that the node does not have.
 
         Args:
-            qos: of those of subscriptions, which are declared with these, or of the others.
+            qos: whether to check the QoS overrides, which subscriptions declare, or the others.
         """
         given = [x for x in self._parameter_overrides if x.startswith(QOS_OVERRIDES) == qos]
         for text in unknown_parameters(given, self._parameters):
@@ -410,7 +410,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             if any(name in changed for name in self.SESSION.CHECKED):
                 self._reader.read(settings, partial(self._check, settings), self._receive)
         except Exception as error:  # noqa: BLE001
-            # Whatever a peer sends, it gets a reason.
+            # Every refused request gets a reason.
             return SetParametersResult(successful=False, reason=public_line(error))
         self._settings = settings
         if self._session is not None:
@@ -420,10 +420,10 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return SetParametersResult(successful=True)
 
     def _check(self, settings: Parameters) -> None:
-        """Reads the files that other parameters would name.
+        """Checks new parameters by reading the files that they name.
 
         Raises:
-            ValueError: one that can not be used, or that must not be named while the node runs.
+            ValueError: a file that can not be used, or that a running node must not read.
         """
         launched, values = values_of(self._at_launch), values_of(settings)
         for name in FILES:
@@ -432,7 +432,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._new_session(settings, lambda output: None)
 
     def _receive(self) -> None:
-        """Receives messages while the executor's thread is kept waiting."""
+        """Receives messages while the executor's thread is blocked."""
         for one in (x for node in self._nodes for x in [*node._connected.values()]):
             with one.handle:
                 while (found := one.handle.take_message(one.msg_type, one.raw)) is not None:
@@ -460,7 +460,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         if name in self._heard:
             self._own.sent(output.data)
         inside = self._inside(output.topic)
-        # What only nodes of this process want is not even made into bytes.
+        # A message that only nodes of this process want needs no publishing.
         if not inside or publisher.get_subscription_count():
             publisher.publish(output.data)
         for one in inside:
@@ -470,16 +470,16 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return bool(self._subscribers(topic))
 
     def _subscribers(self, topic: str) -> int:
-        """How many subscribe to a topic of this node, in this process and in others."""
+        """Number of subscribers to a topic of this node, in this process and in others."""
         others = self._outputs[topic].get_subscription_count()
         return int(others) + len(self._inside(topic))
 
     def _inside(self, topic: str) -> list[SessionNode[Any, Any]]:
-        """The nodes of this process that get a topic of this node as it is."""
+        """The nodes of this process that receive a topic of this node directly."""
         return [] if topic.startswith('/') else self._listeners(self._local_name(topic))
 
     def _local_name(self, topic: str) -> str:
-        """Name of a topic among nodes of this process; shared ones, as /tf, go over ROS."""
+        """Name of a topic within this process; absolute ones, such as /tf, go over ROS."""
         if topic not in self._local_names:
             own = f'{self.get_fully_qualified_name()} {topic}'
             name = own if topic.startswith('/') else self.resolve_topic_name(topic)
@@ -505,7 +505,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._log_status(counts)
 
     def _log_status(self, counts: Counter[str]) -> None:
-        """A line while messages arrive: at once where the status is another, else now and then."""
+        """Logs a line while messages arrive: at once if the status changed, else periodically."""
         if self._session is None or counts['received'] == self._told_at:
             return
         state, self._told_at = self._session.state, counts['received']
@@ -537,10 +537,10 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return DiagnosticStatus.OK, f'{state.status}, {state.summary()}'
 
     def _hardware(self, state: SessionState | None) -> str:
-        """The camera: the frame that its messages name, or else the topic that they come on."""
+        """The camera: the frame of its messages, or else their topic."""
         if state is not None and state.frame_id:
             return state.frame_id
-        # Before its name, a topic that is not shared in this process has that of the node.
+        # The local name of an absolute topic starts with the name of the node.
         return next(reversed(self._heard), '').rpartition(' ')[2]
 
     def _diagnose(self) -> None:

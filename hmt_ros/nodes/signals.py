@@ -1,4 +1,4 @@
-"""What a process does when it is asked to end."""
+"""Handlers of the signals that end a process."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 
 def on_signals(stop: Callable[..., None]) -> None:
-    """Calls a function when a signal asks the process to end; while it ends, signals do nothing.
+    """Calls a function when a signal asks the process to end; ignores signals during its exit.
 
-    A terminal and "ros2 launch" send one each. Python gives them back their usual effect before it
-    has ended, and the second one would kill the process.
+    A terminal and "ros2 launch" send one each. Python restores the default handlers before it
+    exits, so the second one would kill the process.
     """
     numbers = (signal.SIGINT, signal.SIGTERM)
     for number in numbers:

@@ -1,7 +1,7 @@
 """Causes of silence: topics that a node waits for, their publishers, and similar topics.
 
-All but `arrived` runs in the executor's thread, once a period of the diagnostics, and asks the
-graph only about topics on which nothing arrives.
+All methods but `arrived` run in the executor's thread, once per period of the diagnostics, and
+query the graph only for topics on which nothing arrives.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from hmt_ros.nodes.subscribed_topic import SubscribedTopic
 from hmt_ros.sessions.handled import HANDLED
 from hmt_ros.sessions.session import NeededInput, kind_of
 
-# Time without a message after which a topic is silent, and between two warnings of one text, s.
+# Time without a message after which a topic is silent, and interval of repeated warnings, s.
 SILENCE, REPEAT = 3.0, 30.0
-# Number of topics that are suggested instead.
+# Maximum number of topics that are suggested instead.
 _MOST_NAMED = 3
 _IMAGE, _COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
-# The value of image_transport for images of a type, and the topic that is then subscribed to.
+# Value of `image_transport`, and topic of the subscription, by type of the images.
 _TRANSPORTS = {_IMAGE: ('raw', 'image'), _COMPRESSED: ('compressed', 'image/compressed')}
 
 
@@ -44,7 +44,7 @@ class SilentTopics:
     """Watches the topics that a node subscribes to.
 
     Attributes:
-        texts: of the silent topics, as the last look has found them: the topics, and why.
+        texts: cause of silence by silent topics, as found by the last `look`.
     """
 
     def __init__(self, node: Node, warn: Callable[[str], None]) -> None:
@@ -53,16 +53,16 @@ class SilentTopics:
 
     @property
     def silence(self) -> float:
-        """Time since the last message that was to be estimated from, s; 0 while they come."""
+        """Time since the last message of the source that sets the pace, s; 0 while they arrive."""
         last = self._arrivals.get(self._pace)
         since = 0.0 if last is None else time.monotonic() - last
         return since if since > SILENCE else 0.0
 
     def listen(self, inputs: Iterable[SubscribedTopic], pace: str = '') -> None:
-        """Begins anew with other subscriptions; without any, nothing is silent.
+        """Restarts with other subscriptions; without any, nothing is silent.
 
         Args:
-            pace: source of the messages that are estimated from.
+            pace: source of the messages that trigger estimates.
         """
         self._pace = pace
         self._inputs = {one.source: one for one in inputs}
@@ -72,11 +72,11 @@ class SilentTopics:
         self._began = time.monotonic()
 
     def arrived(self, source: str, now: float) -> None:
-        """Takes note of a message."""
+        """Records the arrival of a message."""
         self._arrivals[source] = self._arrivals[kind_of(source)] = now
 
     def look(self, needed: Iterable[NeededInput]) -> None:
-        """Looks for silent topics among those that are needed, and warns of them."""
+        """Finds silent topics among the needed ones, and warns of them."""
         now = time.monotonic()
         newest = self._arrivals.get(self._pace, self._began)
         silent = [one for one in needed if self._is_silent(one, newest if one.with_each else now)]
@@ -99,9 +99,10 @@ class SilentTopics:
         return now - last >= SILENCE
 
     def _like(self, wanted: list[SubscribedTopic], names: list[str]) -> list[Publication]:
-        """Publications of others on some topics, or of the types that these may have.
+        """Publications of other nodes on some topics, or with types that these may have.
 
-        The silhouettes and overlays of our own nodes are no images of a camera.
+        Silhouettes and overlays of the nodes of this package are left out: they are not camera
+        images.
         """
         own = self._node.get_fully_qualified_name()
         topics = dict(self._node.get_topic_names_and_types())
@@ -122,7 +123,7 @@ class SilentTopics:
 def why_silent(
     wanted: list[SubscribedTopic], names: list[str], published: list[Publication]
 ) -> str:
-    """Cause of silence on topics, any one of which is enough, and the remedy."""
+    """Cause of silence on alternative topics, and the remedy."""
     topics = ' or '.join(
         f'{name} ({_short(one.msgtype)})' for one, name in zip(wanted, names, strict=True)
     )
@@ -142,9 +143,9 @@ def why_silent(
 
 
 def _instead(wanted: SubscribedTopic, name: str, published: list[Publication]) -> str:
-    """Topics in place of a topic, those with the most similar names first; '' if there is none."""
+    """Text that suggests other topics, the most similar names first; '' without any."""
     kinds = _TRANSPORTS if _is_image(wanted) else {wanted.msgtype: ('', wanted.topic)}
-    # Those of the type that is wanted before those of the other transport.
+    # Topics of the wanted type precede those of the other transport.
     for kind in sorted(kinds, key=lambda each: each != wanted.msgtype):
         transport, topic = kinds[kind]
         there = sorted({x.topic for x in published if x.msgtype == kind})
@@ -162,5 +163,5 @@ def _is_image(wanted: SubscribedTopic) -> bool:
 
 
 def _short(msgtype: str) -> str:
-    """A type as users write it."""
+    """Short name of a message type, as users write it."""
     return msgtype.replace('/msg/', '/')

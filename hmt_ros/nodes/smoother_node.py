@@ -1,7 +1,7 @@
 """smoother_node: likelihood mixtures in, smoothed poses and trajectories out; around a session.
 
-A node can not know that a stream has ended: when it is deactivated it publishes the poses that are
-still open, and reports on `~/handled` with the source 'finish'.
+A node can not detect the end of a stream: at deactivation it publishes the poses that are still
+open, and reports on `~/handled` with the source 'finish'.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class SmootherNode(SessionNode[SmootherSession, SmootherParameters]):
     def _on_smooth_window(
         self, request: SmoothWindow.Request, response: SmoothWindow.Response
     ) -> Any:
-        # Mixtures that come meanwhile wait, in the middleware or in the queue.
+        # Mixtures that arrive meanwhile wait in the middleware or in the queue.
         def smooth(session: SmootherSession) -> Any:
             span = time_ns(request.from_time), time_ns(request.to_time)
             return session.smooth_span(*span, self.get_logger().info)

@@ -20,8 +20,8 @@ from msg_tools.messages.message_types import register_definitions
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-# For `~/handled`: a client that waits for each answer must not miss the answers to a burst. A turn
-# of the thread that estimates answers 100 dropped messages, and all that waited.
+# For `~/handled`: a client that waits for each report must not miss the reports on a burst. One
+# turn of the estimating thread reports up to 100 dropped messages, and all that waited.
 ANSWERS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
     depth=1,
@@ -30,10 +30,10 @@ LATCHED = QoSProfile(
 )
 
 
-# Largest image that is taken, bytes.
+# Maximum size of an accepted image, bytes.
 LARGEST_IMAGE = 8 * MAX_PIXELS + 2**16
-# Messages that wait while an estimate is made: small ones, those that are as large as images, and
-# transforms of a whole robot.
+# Maximum numbers of messages that wait during an estimate: small messages, messages as large as
+# images, and transforms of a whole robot.
 SMALL_QUEUE, LARGE_QUEUE, TF_QUEUE = 100, 20, 2000
 
 
@@ -41,12 +41,12 @@ class SubscribedTopic(NamedTuple):
     """A subscribed topic.
 
     Attributes:
-        source: name that the session has for it.
-        topic: its name.
+        source: name of the topic in the session.
+        topic: name of the topic in ROS.
         msgtype: for example 'sensor_msgs/msg/Image'.
         qos: quality of service of the subscription.
-        largest: size of the largest message that is taken, bytes.
-        waiting: maximum number of messages that wait while an estimate is made.
+        largest: maximum size of an accepted message, bytes.
+        waiting: maximum number of messages that wait during an estimate.
     """
 
     source: str
@@ -57,7 +57,7 @@ class SubscribedTopic(NamedTuple):
     waiting: int = SMALL_QUEUE
 
 
-# As the listener of tf2 has them.
+# The same as in the listener of tf2.
 _TF_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 _TF_STATIC_QOS = QoSProfile(
     depth=100,
@@ -68,7 +68,7 @@ TRANSFORM_TOPICS = (
     SubscribedTopic(TF_STATIC, '/tf_static', TRANSFORMS_TYPE, _TF_STATIC_QOS, waiting=TF_QUEUE),
     SubscribedTopic(TF, '/tf', TRANSFORMS_TYPE, _TF_QOS, waiting=TF_QUEUE),
 )
-# As many as come in the seconds that `~/smooth_window` may take.
+# Depth for all mixtures that arrive while `~/smooth_window` runs for some seconds.
 _MIXTURES = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
 CAMERA_INFO_TOPIC = SubscribedTopic(CAMERA_INFO, 'camera_info', 'sensor_msgs/msg/CameraInfo')
 
@@ -82,7 +82,7 @@ def image_topic(image_transport: str) -> SubscribedTopic:
 
 
 def input_topics(rows: Iterable[ImageInput]) -> Iterator[SubscribedTopic]:
-    """Topics of the inputs that come with the images, by the table of inputs."""
+    """Topics of the inputs beside the images, by the table of inputs."""
     for row in rows:
         for source, msgtype in row.types.items():
             yield SubscribedTopic(
@@ -96,7 +96,7 @@ def input_topics(rows: Iterable[ImageInput]) -> Iterator[SubscribedTopic]:
 
 
 def types_of_others(rows: Iterable[ImageInput], source: str) -> dict[str, str]:
-    """Types of messages of other packages that a `source` needs, each with its consumer."""
+    """Message types of other packages that a `source` needs, each with its consumer."""
     return {row.types[DETECTIONS]: f'source {source}' for row in rows if DETECTIONS in row.types}
 
 
@@ -106,7 +106,7 @@ def published_with(published: PublishedTopic) -> tuple[str, QoSProfile]:
 
 
 def mixture_topic(source: str, topic: str) -> SubscribedTopic:
-    """Pose mixtures of a person; a subscriber that is slow for a while misses none."""
+    """Pose mixtures of a person, with a queue for a subscriber that is slow for some seconds."""
     return SubscribedTopic(source, topic, POSE_MIXTURE, _MIXTURES)
 
 
@@ -118,13 +118,13 @@ def message_class(msgtype: str) -> Any:
 
 @cache
 def opens_with_header(msgtype: str) -> bool:
-    """Whether messages of a type begin with a std_msgs/Header."""
+    """Whether the first field of a message type is a std_msgs/Header."""
     first = next(iter(message_class(msgtype).get_fields_and_field_types().values()), '')
     return bool(first == 'std_msgs/Header')
 
 
 def read_installed_messages(msgtype: str, needed_by: str) -> None:
-    """Reads the definitions of a package of messages, as it is installed.
+    """Reads the message definitions of an installed package.
 
     Args:
         needed_by: consumer of the messages, for the error.

@@ -1,6 +1,7 @@
 """A node that tracks people: the common part of nodes for one person and for several.
 
-A watchdog tells robots where no image was answered for `stale_time`, by a clock that does not jump.
+A watchdog publishes a warning for robots if no image was answered for `stale_time`, by a monotonic
+clock.
 """
 
 from __future__ import annotations
@@ -40,10 +41,10 @@ class TrackingNode(SessionNode[Any, Any]):
         self._watchdog: threading.Thread | None = None
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Listens."""
+        """Subscribes to the inputs; starts the estimator and the watchdog."""
         result = super().on_activate(state)
         self._inactive = threading.Event()
-        # Not a timer: while the executor serves something else, robots are told all the same.
+        # A thread, because a timer would wait while the executor is busy.
         self._watchdog = threading.Thread(
             target=self._watch, args=(self._session, self._inactive), name='watchdog', daemon=True
         )
@@ -51,7 +52,7 @@ class TrackingNode(SessionNode[Any, Any]):
         return result
 
     def stop(self, timeout: float | None = None) -> bool:
-        """See `SessionNode`; nobody is watched any more."""
+        """Stops the watchdog and the estimator; see `SessionNode`."""
         self._inactive.set()
         if self._watchdog is not None:
             self._watchdog.join()
@@ -74,10 +75,10 @@ class TrackingNode(SessionNode[Any, Any]):
 
     @abstractmethod
     def _start_asked_for(self, request: Reset.Request) -> TrackStart:
-        """The start of the tracks that a request asks for.
+        """The requested start of the tracks.
 
         Raises:
-            ValueError: a request that can not be used.
+            ValueError: an unusable request.
         """
 
     def _on_reset(self, request: Reset.Request, response: Reset.Response) -> Reset.Response:
@@ -91,10 +92,10 @@ class TrackingNode(SessionNode[Any, Any]):
         self.get_logger().info(f'~/reset: {response.message}')
         return response
 
-    # Called by a thread of its own.
+    # Called by the watchdog thread.
 
     def _watch(self, session: TrackingSession, inactive: threading.Event) -> None:
-        """Tells robots of images that are not answered."""
+        """Publishes warnings for robots while no image is answered."""
         count, answered = session.answered, time.monotonic()
         while not inactive.wait(_GLANCE):
             now = time.monotonic()

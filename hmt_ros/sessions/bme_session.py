@@ -1,26 +1,26 @@
-"""The prediction of poses from single images behind its topics.
+"""Session of the pose predictor: images or keypoints in, mixtures over poses out.
 
 The rules, besides those of `CameraSession`:
 
-- Every image that can be used gets one prediction. One without components says that nobody was
-  seen, as no silhouette has the height of a person, or gives the `reason` why it can not say: the
-  scene has not been seen empty.
-- With `use_mask` the mask of an image is its silhouette; an image whose mask shows somebody teaches
-  no background.
-- With `tracked_interval` the track of the filter (`pose_mixture`) is heard. While it says that the
-  person is tracked, images within `tracked_interval` after the last prediction are not looked at.
-  Their messages have no components but the state of the track, so that a subscriber that waits for
-  a prediction goes on: the image was not looked at, which does not say that nobody was seen.
-- The silhouette of every image is published if somebody subscribes to it: that of the background
-  subtraction, empty while the background is being learned. An image that is left to the track has
-  one, too. With `use_mask` there is none besides the mask.
-- With `propagation` a prediction takes the one before into account, unless this is older than
-  `LONGEST_INTERVAL`, comes from another calibration, or from before a jump in time.
-- With `predict_from` 'keypoints' every message of keypoints gets one prediction, from them and
-  those of the last second (`experts.lifter`), in place of the images; without components where
-  fewer than five landmarks are seen. With 'both' an image waits for the keypoints of exactly its
-  stamp, for those of a later stamp, or for an image that is `input_timeout` younger; its silhouette
-  counts where keypoints show nobody. (The product of both is no better than that from keypoints.)
+- Every usable image gets one prediction. A prediction without components means that nobody was
+  seen (the silhouette is too low for a person), or that this is unknown because the scene has not
+  been seen empty; `reason` is set then.
+- With `use_mask` the mask of an image is its silhouette; the background is not learned from an
+  image whose mask shows somebody.
+- With `tracked_interval` the session subscribes to the track of the filter (`pose_mixture`). While
+  the person is tracked, images within `tracked_interval` after the last prediction are not
+  evaluated. Their messages have the state of the track and no components, so that a subscriber that
+  waits for a prediction can continue. Such a message does not mean that nobody was seen.
+- The silhouette of every image is published if it has a subscriber: the result of background
+  subtraction, empty while the background is being learned. Images that are left to the track have
+  one, too. With `use_mask` no silhouette is published.
+- With `propagation` a prediction depends on the previous one, unless that is older than
+  `LONGEST_INTERVAL`, belongs to another calibration, or precedes a jump in time.
+- With `predict_from` 'keypoints' every message of keypoints gets one prediction, from the keypoints
+  of the last second (`experts.lifter`); images are not used. It has no components if fewer than
+  five landmarks are seen. With 'both' an image waits for the keypoints of exactly its stamp, for
+  keypoints of a later stamp, or for an image that is `input_timeout` younger; its silhouette is
+  used if the keypoints show nobody. (The product of both is no better than keypoints alone.)
 """
 
 from __future__ import annotations
@@ -86,15 +86,15 @@ from msg_tools.messages.pose_mixtures import (
 
 TRACK, SILHOUETTE = 'pose_mixture', 'silhouette'
 TOPICS = {PREDICTION: PublishedTopic('hmt_msgs/msg/PoseMixture')}
-# Silhouettes are large: bags have none.
+# Silhouettes are too large for bags.
 _TOPICS_OF_NODE = {**TOPICS, SILHOUETTE: PublishedTopic('sensor_msgs/msg/Image')}
 
 
-# Least height of a silhouette that counts as a person, px.
+# Minimum height of the silhouette of a person, px.
 LEAST_HEIGHT = 40
-# Longest interval without a person after which the image before still counts, s.
+# Maximum age of the previous prediction for propagation, s.
 LONGEST_INTERVAL = 0.5
-# Time without a message after which a track no longer counts.
+# Maximum time between an image and the last message of the track, ns.
 _SURE_NS = SECOND_NS
 # Relative standard deviation of the size of a person whose stature is known.
 _MEASURED_SPREAD = 0.02
@@ -102,15 +102,15 @@ _MEASURED_SPREAD = 0.02
 
 @dataclass(frozen=True)
 class BmeState(CameraState):
-    """State of the prediction: its status is 'no camera', 'learning', 'nobody' or 'predicting'.
+    """State of the predictor: its status is 'no camera', 'learning', 'nobody' or 'predicting'.
 
-    Of the counts 'predicted' are images with or without somebody, 'empty' those without, and
-    'left' are images that were not looked at because the person is tracked.
+    The count 'predicted' is of images with or without a person, 'empty' of images without one,
+    and 'left' of images that were not evaluated because the person is tracked.
 
     Attributes:
-        modes: components of the last prediction.
-        height: of the last silhouette, px.
-        support: likeness of the silhouette to those of the training set, 0 to 1.
+        modes: number of components of the last prediction.
+        height: height of the last silhouette, px.
+        support: similarity of the silhouette to those of the training set, 0 to 1.
     """
 
     modes: int = 0
@@ -152,7 +152,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._scene = EmptyScene(
             BackgroundModel.from_image(read_picture(file)) if file else BackgroundModel()
         )
-        # OpenCV's model computes in memory of its own.
+        # OpenCV's background model computes in an internal buffer: one thread at a time.
         self._background_in_use = threading.Lock()
         self._height, self._support, self._reason = 0, math.nan, ''
         # Whether the last prediction needed no background.
@@ -164,9 +164,9 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
     def restart(self) -> None:
         """See `Session`."""
-        # The known background is kept. The last prediction, with its stamp:
+        # The background is kept. Last prediction, and its stamp, ns:
         self._previous: tuple[GaussianMixture, int] | None = None
-        # Stamps of the last image that was looked at, and of the last one with a track.
+        # Stamps of the last evaluated image, and of the last message of a tracked person, ns.
         self._looked: int | None = None
         self._tracked: int | None = None
         self._by_keypoints: KeypointPredictor | None = None
@@ -217,7 +217,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             self._tracked = stamp if tracked else None
 
     def _take_keypoints(self, row: ImageInput, message: Any, stamp: int) -> None:
-        """Predicts from keypoints and those of the last second, without an image."""
+        """Predicts from the keypoints of the last second, without an image."""
         camera = self._camera
         if camera is None:
             self._log.skip(
@@ -236,7 +236,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._tell(mixture, stamp, self._frame_id or self._frame or FRAME_ID)
 
     def _lifted(self, stamp: int, camera: Camera) -> GaussianMixture | None:
-        """The prediction from the keypoints that have come; None: they show nobody at a stamp."""
+        """Return the prediction from keypoints; None if they show nobody at the stamp."""
         assert self._lifter is not None
         made = self._by_keypoints
         if made is None:
@@ -248,7 +248,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             )
         taken = self._inputs[KEYPOINTS].take_all(stamp)
         for each, keypoints in taken.items():
-            # Some may come after those of a later image.
+            # Keypoints may arrive after those of a later image.
             if keypoints is not None and each / SECOND_NS > made.newest:
                 known, _ = keypoints.named_for(
                     self._predictor.body, self.parameters.keypoint_scheme
@@ -266,12 +266,12 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if not in_turn or not self._is_left_to_track(stamp) or self._wanted(SILHOUETTE):
             super()._take_image(message, stamp)
             return
-        # Not even decoded.
+        # The image is not even decoded.
         self._newest = stamp
         self._leave_to_track(stamp, str(message.header.frame_id) or self._frame or FRAME_ID)
 
     def _is_left_to_track(self, stamp: int) -> bool:
-        """Whether an image need not be predicted from."""
+        """Whether an image needs no prediction because the person is tracked."""
         interval = self.parameters.tracked_interval * SECOND_NS
         if self._looked is None or self._tracked is None:
             return False
@@ -301,7 +301,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._tell(mixture, waiting.stamp_ns, waiting.frame_id)
 
     def _tell(self, mixture: GaussianMixture | None, stamp: int, frame_id: str) -> None:
-        """Counts and publishes a prediction; None: nobody is seen."""
+        """Counts and publishes a prediction; None means that nobody is seen."""
         self._log.counts['predicted'] += 1
         if mixture is None:
             self._log.counts['empty'] += 1
@@ -310,7 +310,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             self._publish(PREDICTION, stamp, self._message(mixture, stamp, frame_id))
 
     def _mixture_of(self, waiting: WaitingImage, camera: Camera) -> GaussianMixture | None:
-        """The prediction from an image; None if nobody is seen."""
+        """Return the prediction; None if nobody is seen or the background is unknown."""
         given = waiting.mask
         if self._cue == FROM_BOTH:
             lifted = self._lifted(waiting.stamp_ns, camera)
@@ -343,11 +343,11 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         return found.mixture
 
     def _judged_silhouette(self, waiting: WaitingImage) -> Mask:
-        """The silhouette of an image, empty as long as the scene was not seen empty."""
+        """Return the silhouette of an image; it is empty until the scene has been seen empty."""
         scene, stamp = self._scene, waiting.stamp_ns
         with self._background_in_use:
             if scene.seen:
-                self._look_at_scene(waiting, scene.background, 'configure the node anew')
+                self._look_at_scene(waiting, scene.background, 'configure the node again')
                 scene.judge(waiting.image, stamp)
                 if scene.known:
                     return scene.background.silhouette(waiting.image)
@@ -357,7 +357,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         return np.zeros(waiting.image.shape[:2], np.bool_)
 
     def _known_before(self, stamp_ns: int) -> tuple[GaussianMixture | None, float]:
-        """The poses predicted before an image, if they still count, and the time since then, s."""
+        """Return the previous prediction, if it is recent, and the time since then, s."""
         previous = self._previous
         if self.parameters.propagation == ALONE or previous is None:
             return None, STEP
@@ -384,7 +384,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         )
 
     def _publish_silhouette(self, of: WaitingImage, mask: Mask | None = None) -> None:
-        """Publishes the silhouette of an image; None: it is not predicted from."""
+        """Publishes the silhouette of an image; computes it if it is not given."""
         known = mask is not None or (of.mask is None and self._scene.known)
         if not known or not self._wanted(SILHOUETTE):
             return
@@ -416,7 +416,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         return pose_mixture_message(self._messages, content)
 
     def predict_once(self, message: Any) -> Any:
-        """The prediction from one image alone, before the present background.
+        """Predicts from one image alone, with the present background.
 
         May be called by any thread, at any time.
 
@@ -427,8 +427,8 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             hmt_msgs/PoseMixture.
 
         Raises:
-            ValueError: the image can not be used, nothing is known of camera or background, or
-                nobody is seen.
+            ValueError: the image can not be used, camera or background is unknown, or nobody is
+                seen.
         """
         camera = self._camera
         if camera is None:
@@ -463,7 +463,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
 
 def _predictor_of(parameters: BmeParameters) -> tuple[PosePredictor, float]:
-    """The model for the person, and the relative deviation of the size of people from it."""
+    """Return the predictor for the person, and the relative standard deviation of body size."""
     with named_file('model_file', parameters.model_file, 'model of poses'):
         predictor = load_predictor(parameters.model_file or SHIPPED)
     if parameters.propagation == BY_EXPERTS and predictor.dynamics is None:

@@ -1,4 +1,4 @@
-"""The camera of images: from its field of view, or from a calibration file.
+"""Camera from a field of view, or from a calibration file.
 
 Calibration files are those of OpenCV (FileStorage: YAML, XML or JSON), of ROS (camera_calibration,
 or a camera_info as `ros2 topic echo --once` or `rostopic echo -n1` prints it), the camchain of
@@ -30,7 +30,7 @@ else:
     import tomli as tomllib
 
 LARGEST_FILE = 1_000_000  # bytes
-# Names of the entries in several programs.
+# Names of the entries in files of several programs.
 _MATRIX = (
     'camera_matrix',
     'Camera_Matrix',
@@ -59,10 +59,10 @@ _WIDTH, _HEIGHT = (
 _SIZE = ('size', 'resolution')
 _FISHEYE = ('fisheye', 'fisheye_model')
 _TAG_OF_OPENCV = re.compile(r'(?<=[:-] )!{1,2}<?opencv-[\w-]+>?')
-# No camera has a matrix or a distortion of so many characters.
+# A list that is too long for the matrix or the distortion of a camera.
 _LONG_LIST = re.compile(r'\[[^][]{2000,}\]')
-_MOST_NUMBERS = 100  # of a matrix, or of the coefficients of a lens
-_MOST_POINTS = 200  # in a line; the time that keys of many parts take in TOML is quadratic
+_MOST_NUMBERS = 100  # maximum number of values of a matrix or a distortion
+_MOST_POINTS = 200  # maximum number of dots in a line: parsing of dotted TOML keys is quadratic
 
 Tell = Callable[[str], object]
 
@@ -73,12 +73,12 @@ def camera_of_view(
     vertical: float | None = None,
     aspect: float = 1.0,
 ) -> Camera:
-    """A camera whose axis meets the middle of the image.
+    """Return a camera whose optical axis passes through the centre of the image.
 
     Args:
         size: width and height of the image, px.
-        horizontal: angle from the left border to the right, degrees; or
-        vertical: angle from the upper border to the lower, degrees.
+        horizontal: horizontal field of view, degrees; None: `vertical` is given.
+        vertical: vertical field of view, degrees; only used without `horizontal`.
         aspect: width of a pixel over its height.
     """
     width, height = size
@@ -90,16 +90,16 @@ def camera_of_view(
 
 
 def read_camera(path: Path, size: tuple[int, int], tell: Tell = lambda text: None) -> Camera:
-    """The camera that a calibration file describes.
+    """Read the camera of a calibration file.
 
     Args:
-        path: the file; with `:NAME` behind it, the camera NAME of several in the file.
-        size: width and height of the images, px; a calibration for images of the same shape is
-            scaled, one without a size is for these.
-        tell: takes a line on what is neglected or scaled.
+        path: the file, or FILE:NAME for the camera NAME of several in the file.
+        size: width and height of the images, px; a calibration for another size of the same shape
+            is scaled, and a calibration without a size is assumed to be for this size.
+        tell: called with a line on each neglected or scaled entry.
 
     Raises:
-        ValueError: no calibration in the file, a damaged one, or one for another shape.
+        ValueError: the file has no calibration, a damaged one, or one for another shape of images.
     """
     file, name = path, ''
     if not path.exists() and ':' in path.name:
@@ -123,7 +123,7 @@ def read_camera(path: Path, size: tuple[int, int], tell: Tell = lambda text: Non
 
 
 def _content(path: Path, text: str) -> tuple[Any, str]:
-    """The entries of a file, and the model of the distortion where they name none."""
+    """Return the entries of a file, and the default model of the distortion."""
     if path.suffix.lower() == '.toml':
         if any(line.count('.') > _MOST_POINTS for line in text.splitlines()):
             raise ValueError(f'a line with more than {_MOST_POINTS} points')
@@ -131,7 +131,7 @@ def _content(path: Path, text: str) -> tuple[Any, str]:
     start = text.lstrip()
     if start.startswith('<?xml'):
         return _of_xml(start), 'pinhole'
-    # Points of a calibration pattern, or the poses of hundreds of images: no camera needs them.
+    # Removes the points of a calibration pattern and the poses of its images, which are not needed.
     text = _LONG_LIST.sub('"a long list"', start)
     of_opencv = start.startswith(('%YAML', '{'))
     if of_opencv:
@@ -141,13 +141,13 @@ def _content(path: Path, text: str) -> tuple[Any, str]:
         return load_plain_json(re.sub(r'(?<=[\s\[,])-?\.(Nan|Inf)\b', 'NaN', text)), 'pinhole'
     if of_opencv:
         text = _TAG_OF_OPENCV.sub('', text.partition('\n')[2])
-    # An echoed topic has a line of --- behind each message: the first counts.
+    # An echoed topic has a line --- after each message; the first message is used.
     first = re.split('^---', text.strip().removeprefix('---'), flags=re.MULTILINE)[0]
     return load_plain_yaml(first), 'pinhole' if of_opencv else ''
 
 
 def _of_xml(text: str) -> Any:
-    """The entries of an XML file of OpenCV; numbers stay texts."""
+    """Return the entries of an XML file of OpenCV, with numbers as strings."""
     if '<!DOCTYPE' in text or '<!ENTITY' in text:
         raise ValueError('XML with a DOCTYPE, wanted a file of OpenCV')
     try:
@@ -166,7 +166,7 @@ def _of_element(element: ET.Element) -> Any:
 
 
 def _calibrations(content: Any, name: str = '') -> dict[str, dict[Any, Any]]:
-    """The tables with a matrix, by their names."""
+    """Return the tables that have a camera matrix, by name."""
     if not isinstance(content, dict):
         return {}
     if _first(content, _MATRIX) is not None:
@@ -175,13 +175,13 @@ def _calibrations(content: Any, name: str = '') -> dict[str, dict[Any, Any]]:
 
 
 def _entries(content: dict[Any, Any], model: str, size: tuple[int, int]) -> dict[str, Any]:
-    """Entries of a camera_info.
+    """Return the entries of a camera_info.
 
     Args:
-        model: of the distortion, where the content names none.
+        model: default model of the distortion.
     """
     k, d = _numbers(_first(content, _MATRIX)), _numbers(_first(content, _DISTORTION) or [])
-    if 4 <= len(k) <= 6:  # as kalibr writes them, those of other models than a pinhole first
+    if 4 <= len(k) <= 6:  # kalibr: parameters of models other than the pinhole precede these four
         fx, fy, cx, cy = k[-4:]
         k = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
     given = _first(content, _WIDTH), _first(content, _HEIGHT)
@@ -213,18 +213,18 @@ def _entries(content: dict[Any, Any], model: str, size: tuple[int, int]) -> dict
 
 
 def _first(content: dict[Any, Any], names: tuple[str, ...]) -> Any:
-    """The entry under the first of some names that is there; None: under none."""
+    """Return the entry of the first name that is present; None if none is."""
     return next((content[name] for name in names if content.get(name) is not None), None)
 
 
 def _numbers(value: Any) -> list[float]:
-    """The numbers of a list, of a list of rows, or of the `data` of a matrix."""
+    """Return the numbers of a list, of a list of rows, or of the `data` of a matrix."""
     if isinstance(value, dict):
         value = value.get('data')
     rows = value if isinstance(value, list) else [value]
     values = [x for row in rows for x in (row if isinstance(row, list) else [row])]
     try:
-        # YAML takes 1e-05, without a point, for text.
+        # YAML reads 1e-05, without a point, as a string.
         if len(values) <= _MOST_NUMBERS and not any(isinstance(x, bool) for x in values):
             return [float(x) for x in values]
         seen = f'{len(values)} values'

@@ -1,8 +1,8 @@
-"""The camera by transforms to other frames: gravity, its height, its pose.
+"""Gravity, height and pose of the camera, from transforms to other frames.
 
-A frame with z up (`gravity_frame`) gives the direction of gravity and, where z = 0 is the floor,
-the height of the camera. A frame that stands still (`fixed_frame`) gives the motion of the camera.
-Both may be one.
+A frame with z up (`gravity_frame`) gives the direction of gravity and, if z = 0 is the floor, the
+height of the camera. A stationary frame (`fixed_frame`) gives the motion of the camera. They may be
+the same frame.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from hmt_ros.sessions.transform_buffer import Transform, TransformBuffer, Transf
 from hmt_ros.tracking.ground import KnownGround
 from hmt_ros.tracking.settings import MAX_EXTRAPOLATION_TIME
 
-# A vector that is shorter has no direction.
+# Minimum length of a vector that has a direction.
 _SHORTEST = 1e-6
 
 
-# Standard deviation of a direction from transforms: of an inertial sensor and its mounting, rad.
+# Standard deviation of a direction from transforms (inertial sensor and its mounting), rad.
 UP_SIGMA = 0.01
 
 
 class CameraFrames:
-    """The frames that transforms lead to from the camera, with gravity and pose.
+    """Gravity and pose of the camera, relative to frames that are connected by transforms.
 
     Args:
-        gravity_frame: name of a frame with z up; empty: there is none.
-        fixed_frame: name of a frame that stands still; empty: there is none.
+        gravity_frame: name of a frame with z up; '': none.
+        fixed_frame: name of a stationary frame; '': none.
         floor: whether z = 0 of `gravity_frame` is the floor.
 
     Attributes:
-        newest: whether that was at the image that was looked up last.
-        heard: whether any transform has come.
-        pose: of the camera in `fixed_frame` at the image that was looked up last; None: unknown.
+        newest: whether gravity was found at the last image.
+        heard: whether any transform was received.
+        pose: pose of the camera in `fixed_frame` at the last image; None if unknown.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class CameraFrames:
     ) -> None:
         self.gravity_frame = gravity_frame
         self.fixed_frame = fixed_frame
-        # The newest direction against gravity and height above z = 0 of its frame; None: none yet.
+        # Newest direction against gravity, and height above z = 0 of its frame, m; None: unknown.
         self._gravity: tuple[Array, float] | None = None
         self.newest = False
         self.pose: Transform | None = None
@@ -60,7 +60,7 @@ class CameraFrames:
         return bool(self.gravity_frame or self.fixed_frame)
 
     def take(self, message: Any, *, static: bool) -> list[str]:
-        """Takes a tf2_msgs/TFMessage; see `TransformBuffer.put`."""
+        """Stores a tf2_msgs/TFMessage; see `TransformBuffer.put`."""
         self.heard = True
         return self._transforms.put(message, static=static)
 
@@ -70,7 +70,7 @@ class CameraFrames:
         self._gravity, self.newest, self.pose = None, False, None
 
     def is_settled(self, camera_frame: str, stamp_ns: int, timeout_ns: float) -> bool:
-        """Whether an image need not wait: its transforms are there, or those of a later time."""
+        """Whether an image need not wait: its transforms are known, or later ones have come."""
         if self._transforms.has_later(stamp_ns, timeout_ns):
             return True
         try:
@@ -81,17 +81,17 @@ class CameraFrames:
         return True
 
     def look(self, camera_frame: str, stamp_ns: int) -> list[tuple[str, str]]:
-        """Looks gravity and the pose of the camera up at the time of an image.
+        """Looks up gravity and the pose of the camera at the time of an image.
 
         Returns:
-            The faults; for a missing transform, the one that was wanted and those there are.
+            Kind and text of each fault.
         """
         gravity = self._look_for_gravity(camera_frame, stamp_ns) if self.gravity_frame else []
         pose = self._look_for_pose(camera_frame, stamp_ns) if self.fixed_frame else []
         return gravity + pose
 
     def known_ground(self, otherwise: KnownGround) -> KnownGround:
-        """The ground known otherwise, with gravity and height from the newest transforms."""
+        """Return `otherwise`, with gravity and height of the newest transforms, if known."""
         if self._gravity is None:
             return otherwise
         up, height = self._gravity
@@ -105,7 +105,7 @@ class CameraFrames:
         except TransformError as error:
             text = (
                 f'no transform from gravity_frame {name!r} to {camera_frame!r} at the image '
-                f'of {stamp_ns} ns: {error}; the track goes on with what was known of gravity'
+                f'of {stamp_ns} ns: {error}; the track continues with what was known of gravity'
             )
             return [('no transform', text)]
         up = found.rotation[:, 2]
@@ -135,10 +135,10 @@ class CameraFrames:
 
 
 def unit_vector(vector: Sequence[float], name: str) -> Array:
-    """A vector (3,) at unit length.
+    """Scale a vector (3,) to unit length.
 
     Raises:
-        ValueError: not three finite numbers, or a vector without length.
+        ValueError: the vector is not three finite numbers, or has no length.
     """
     v = np.asarray(vector, dtype=np.float64)
     size = length(v) if v.shape == (3,) else math.nan

@@ -1,13 +1,13 @@
 """Sessions that estimate from the images of one camera.
 
-Images are taken in the order of their stamps. They wait until a calibrated camera_info has come,
-and for other inputs (`image_inputs`); at most `MOST_INCOMPLETE` wait, the oldest are dropped. A
-session is late where messages have come during an estimate while images waited for it: only the
-newest `queue_size` of the images that wait for no other input are then estimated from.
+Images are used in the order of their stamps. They wait for the first calibrated camera_info and for
+other inputs (`image_inputs`); at most `MOST_INCOMPLETE` wait, and the oldest are dropped. A session
+is late if messages have arrived during an estimate while images waited for it. Then only the newest
+`queue_size` of the images that wait for no other input are used.
 
-Where a frame is named an image also waits for the transforms of its stamp, or for an image or a
-transform that is `input_timeout` younger, and never so long that it would be dropped. Where they do
-not come, the gravity known before holds, and the camera is taken to go on as before.
+If a frame is named, an image also waits for the transforms of its stamp, or for an image or a
+transform that is `input_timeout` younger, and never so long that it would be dropped. Without its
+transforms the last known gravity applies, and the camera is assumed to continue its motion.
 """
 
 from __future__ import annotations
@@ -52,29 +52,29 @@ from msg_tools.messages.images import ImageError, decode_picture
 CAMERA_INFO, IMAGE = 'camera_info', 'image'
 CAMERA_MOVED = 'the camera has moved since the background was taken'
 IN_BACKGROUND = 'the background was learned with the person in it'
-FRAME_ID = 'camera_optical_frame'  # where neither image nor camera_info names a frame
+FRAME_ID = 'camera_optical_frame'  # default if neither image nor camera_info names a frame
 
 CameraParameters = TypeVar('CameraParameters', bound=CameraNodeParameters)
 
-# Images that may wait for other inputs: half a second of a usual camera.
+# Maximum number of images that wait for other inputs: half a second of a usual camera.
 MOST_INCOMPLETE = 16
-# Bytes of the images that may wait.
+# Maximum size of the images that wait, bytes.
 MOST_BYTES = 2**29
 _LARGEST_PICTURE_FILE = 2**28  # bytes
-# Least time by which a later input may be later, to end the wait of an image, s.
+# Lower bound of the time ahead up to which a later input ends the wait of an image, s.
 _LATER = 1.0
-# Frames that are remembered; a camera has one.
+# Maximum number of frames that are remembered; a camera has one.
 _MOST_FRAMES = 8
 
 
 class WaitingImage(NamedTuple):
-    """An image that has come.
+    """An image that was received.
 
     Attributes:
         image: (H, W, 3) BGR.
-        stamp_ns: of the image.
+        stamp_ns: stamp of the image, ns.
         frame_id: optical frame of the camera.
-        given: content of the inputs that have come with it, by name; None: nothing.
+        given: content of the inputs for the image, by name; None: no content.
     """
 
     image: Image
@@ -83,17 +83,17 @@ class WaitingImage(NamedTuple):
     given: Mapping[str, Any] = MappingProxyType({})
 
     def content(self, name: str) -> Any:
-        """Content of an input for the image; None: nothing."""
+        """Return the content of an input for the image; None if there is none."""
         return self.given.get(name)
 
     @property
     def mask(self) -> Mask | None:
-        """Where a segmenter sees the person, (H, W); without a pixel: nobody was seen."""
+        """Mask (H, W) of the person by a segmenter; empty if nobody was seen, None if unknown."""
         return self.content(MASK)
 
     @property
     def depth(self) -> NDArray[np.float32] | None:
-        """Depth of the surface at each pixel, (H, W) m; None: unknown."""
+        """Depth of the surface at each pixel, (H, W) m; None if unknown."""
         return self.content(DEPTH)
 
 
@@ -108,7 +108,7 @@ class CameraState(SessionState):
     moved: bool = False
 
     def trouble(self) -> str:
-        """Whether the background is of no use."""
+        """Return why the background is unusable; '' if it is usable."""
         return CAMERA_MOVED if self.moved else ''
 
 
@@ -116,8 +116,8 @@ class CameraSession(Session[CameraParameters, State]):
     """A session that estimates from images; see `Session` for arguments and attributes.
 
     Attributes:
-        rows: inputs that may come with the images.
-        frames: that transforms lead to from the camera; without a name none are taken.
+        rows: inputs that may accompany the images.
+        frames: frames related to the camera by transforms; if none is named, transforms are unused.
     """
 
     COUNTED = IMAGE
@@ -134,10 +134,10 @@ class CameraSession(Session[CameraParameters, State]):
         self._newest: int | None = None
         self.rows = self.inputs_of(self.parameters)
         self._inputs = ImageInputs(self.rows, self._log)
-        # Messages of `floats` may have no stamp: then it is that of the newest camera_info.
+        # Messages of `floats` may have no stamp: that of the newest camera_info replaces it.
         self._floats, self._info_stamp = self.parameters.source == 'floats', 0
-        # Images that have come since the last estimate; whether some were left when it was
-        # interrupted; and stamps of those that were dropped.
+        # Number of images since the last estimate; whether images were left when it was
+        # interrupted; and stamps of dropped images.
         self._fresh = 0
         self._left = False
         self._dropped: deque[int] = deque(maxlen=REMEMBERED)
@@ -154,20 +154,20 @@ class CameraSession(Session[CameraParameters, State]):
 
     @classmethod
     def inputs_of(cls, parameters: Any) -> tuple[ImageInput, ...]:
-        """Inputs that may come with the images, by the parameters."""
+        """Return the inputs that may accompany the images, by the parameters."""
         return (MASK_INPUT,)
 
     def _awaited(self) -> list[ImageInput]:
-        """The inputs that images wait for."""
+        """Return the inputs that images wait for."""
         return [row for row in self.rows if row.is_used(self.parameters)]
 
     @abstractmethod
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
-        """Estimates from an image of the size that the camera has."""
+        """Estimates from an image, which has the size of the camera."""
 
     @abstractmethod
     def _status(self) -> tuple[str, str]:
-        """Status and wants of the state, once the camera is known."""
+        """Return `status` and `wants` of the state, once the camera is known."""
 
     @property
     def most_waiting(self) -> int:
@@ -180,11 +180,11 @@ class CameraSession(Session[CameraParameters, State]):
         super()._drop(stamp_ns)
 
     def _is_ready(self, waiting: WaitingImage) -> bool:
-        """Whether an image need not wait for anything but a camera_info."""
+        """Whether an image waits for nothing but a camera_info."""
         return self._missing(waiting.stamp_ns) is None and self._has_transforms(waiting)
 
     def _missing(self, stamp: int) -> ImageInput | None:
-        """The first input that an image waits for."""
+        """Return the first input that an image waits for; None if it waits for none."""
         within = max(self.parameters.input_timeout, _LATER) * SECOND_NS
         for row in self._awaited():
             if not self._inputs[row.name].is_settled(stamp, within) and not self._is_overdue(stamp):
@@ -192,12 +192,12 @@ class CameraSession(Session[CameraParameters, State]):
         return None
 
     def _is_overdue(self, stamp: int) -> bool:
-        """Whether an image has waited for its inputs as long as it may."""
+        """Whether an image has waited for `input_timeout`."""
         assert self._newest is not None
         return self._newest - stamp > self.parameters.input_timeout * SECOND_NS
 
     def _has_transforms(self, waiting: WaitingImage) -> bool:
-        """Whether an image need not wait for transforms to frames."""
+        """Whether an image does not wait for transforms."""
         if not self.frames.wanted or len(self._waiting) > self.most_waiting:
             return True
         timeout = self.parameters.input_timeout * SECOND_NS
@@ -207,11 +207,11 @@ class CameraSession(Session[CameraParameters, State]):
 
     def _use(self, source: str, turn: Turn) -> None:
         super()._use(source, turn)
-        # Those that were put aside did not come while the session was late.
+        # Messages that were put aside before do not mean that the session is late.
         self._fresh -= max(len(turn.use) - 1, 0)
 
     def _jump_back(self, first: int, last: int) -> None:
-        """See `Session`; images that wait are used or dropped, and their inputs are forgotten."""
+        """See `Session`; waiting images are used or dropped, inputs of other times are dropped."""
         self._end()
         self._log.counts['dropped'] += len(self._waiting)
         self._waiting.clear()
@@ -241,7 +241,7 @@ class CameraSession(Session[CameraParameters, State]):
         return self._info_stamp if told is None else told
 
     def _read_input(self, row: ImageInput, message: Any, stamp: int) -> Any:
-        """The content of a message, as `ImageInput.read`."""
+        """Return the content of a message, as `ImageInput.read` does."""
         assert row.read is not None
         return row.read(message, stamp)
 
@@ -263,14 +263,14 @@ class CameraSession(Session[CameraParameters, State]):
             for text in neglected:
                 self._log.note('camera_info', text, warn=True)
         if known is not None and camera != known:
-            text = f'camera_info changes: {self.ESTIMATE} starts anew'
+            text = f'camera_info changes: {self.ESTIMATE} starts again'
             self._log.note('calibration', text)
             self.restart()
 
     def _see_frame(self, source: str, message: Any) -> None:
-        """Warns where the messages of a camera name several frames, once for each frame.
+        """Warns once for each further frame that the messages of a camera name.
 
-        Two publishers on one topic, or the camera_info of another camera, else go unnoticed.
+        Otherwise two publishers on one topic, or the camera_info of another camera, go unnoticed.
         """
         frame, seen = str(message.header.frame_id), self._named_frames[source]
         if not frame or frame in seen or len(seen) == _MOST_FRAMES:
@@ -305,7 +305,7 @@ class CameraSession(Session[CameraParameters, State]):
         self._waiting.append(WaitingImage(image, stamp, str(message.header.frame_id)))
 
     def _end(self) -> int:
-        """Estimates from the images that wait for inputs which do not come any more."""
+        """Estimates from all waiting images, as no more inputs will arrive."""
         while self._waiting and self._camera is not None:
             self._estimate_next(self._camera)
         return self._newest or 0
@@ -327,12 +327,12 @@ class CameraSession(Session[CameraParameters, State]):
                 self._leave_out_late_images()
             while self._waiting and not self._left and self._is_ready(self._waiting[0]):
                 self._estimate_next(self._camera)
-                # Messages that have come meanwhile decide which image is next.
+                # Messages that have arrived meanwhile decide which image is next.
                 self._left = bool(self._waiting) and self.interrupted()
         self._drop_incomplete_images()
 
     def _leave_out_late_images(self) -> None:
-        """Drops all but the newest of the images that need not wait."""
+        """Drops all but the newest `queue_size` of the images that are ready."""
         ready = sum(1 for _ in takewhile(self._is_ready, self._waiting))
         for _ in range(ready - self.parameters.queue_size):
             self._drop(self._waiting.popleft().stamp_ns)
@@ -377,7 +377,7 @@ class CameraSession(Session[CameraParameters, State]):
         self._estimate(waiting._replace(frame_id=frame, given=given), camera)
 
     def _frame_of(self, waiting: WaitingImage) -> str:
-        """Optical frame of the camera, as the image names it, or else the camera_info."""
+        """Return the optical frame that the image names, or else the camera_info."""
         return waiting.frame_id or self._frame or FRAME_ID
 
     def _status_and_wants(self) -> tuple[str, str]:
@@ -388,7 +388,7 @@ class CameraSession(Session[CameraParameters, State]):
 
 
 def camera_info_fault(error: CameraInfoError, source: str) -> str:
-    """Fault of a camera_info, and the remedy."""
+    """Return the text of a fault of a camera_info, with the remedy."""
     text = f'{source}{str(error).removeprefix("camera info")}'
     if isinstance(error, UncalibratedError):
         return f'{text}; calibrate the camera, and let its driver publish the result'
@@ -396,21 +396,21 @@ def camera_info_fault(error: CameraInfoError, source: str) -> str:
 
 
 def camera_moved_fault(shift: float, stamp_ns: int, remedy: str) -> str:
-    """Shift of the scene after the camera has moved, and the remedy.
+    """Return the text of a warning that the camera has moved, with the remedy.
 
     Args:
-        shift: of the scene, px; NaN: unknown.
-        remedy: way to take a new background.
+        shift: shift of the scene, px; NaN: unknown.
+        remedy: action that takes a new background.
     """
     far = 'elsewhere' if math.isnan(shift) else f'{shift:.0f} px away'
     return (
         f'{CAMERA_MOVED}: at the image of {stamp_ns} ns the scene is {far}; fix the camera, take '
-        f'background_file anew, or let the background be learned, and {remedy}'
+        f'background_file again, or let the background be learned, and {remedy}'
     )
 
 
 def check_size(image: Image, camera: Camera) -> None:
-    """Raises ValueError where an image has not the size that the camera has."""
+    """Raises ValueError if an image does not have the size of the camera."""
     height, width = image.shape[:2]
     if (width, height) != (camera.width, camera.height):
         raise ValueError(
@@ -420,10 +420,10 @@ def check_size(image: Image, camera: Camera) -> None:
 
 
 def read_picture(file: str) -> Image:
-    """The picture (H, W, 3), BGR, in a PNG or JPEG file that a parameter names.
+    """Read the picture (H, W, 3), BGR, in the PNG or JPEG file of `background_file`.
 
     Raises:
-        ValueError: there is none in the file, or one that is too large.
+        ValueError: the file has no picture, or is too large.
     """
     with named_file('background_file', file, 'PNG or JPEG image'):
         try:

@@ -1,9 +1,9 @@
-"""Mixtures over poses in a frame that stands still, in place of that of a camera that moves.
+"""Mixtures over poses in a stationary frame, instead of the frame of a moving camera.
 
-A pose has its root in a frame with the axes of a camera: x right, y down, z forward. So mixtures
-go to the frame `<fixed_frame>_optical`, which has the origin of `fixed_frame` and these axes where
-z of `fixed_frame` points up: somebody who stands is far from the poles of the root's angles,
-whichever way the person faces. `/tf` tells where it is.
+The root of a pose refers to a frame with the axes of a camera: x right, y down, z forward. Mixtures
+are therefore published in the frame `<fixed_frame>_optical`, which has the origin of `fixed_frame`
+and these axes, provided that z of `fixed_frame` points up: the root angles of a standing person are
+then far from their poles, whichever way the person faces. `/tf` has the transform.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from hmt_ros.tracking.camera_motion import CameraMotion
 
 # Rotation to (x forward, y left, z up) from (x right, y down, z forward).
 FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-# A direction of view that is this near to the vertical has no heading, as sine of the angle.
+# Sine of the angle between view and vertical below which the view has no heading.
 _VERTICAL = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class FixedFrame:
-    """A frame that stands still, as the camera sees it at one image.
+    """A stationary frame, with the pose of the camera at one image.
 
     Attributes:
-        name: of the frame, whose z axis points up.
+        name: name of the frame, whose z axis points up.
         camera: pose of the camera in it: p_fixed = R p_camera + t.
-        turn: angle about z by which the root was turned in the image before, up to whole turns,
-            rad.
+        turn: change of the root's angle about z by the transform at the previous image, rad; it
+            determines the number of whole turns.
     """
 
     name: str
@@ -48,7 +48,7 @@ class FixedFrame:
 
     @property
     def motion(self) -> CameraMotion:
-        """From the frame of the camera to that frame."""
+        """Transform from the frame of the camera to the frame `optical`."""
         back = FROM_OPTICAL.T
         return CameraMotion(
             product(back, self.camera.rotation), product(back, self.camera.translation)
@@ -57,11 +57,11 @@ class FixedFrame:
     def placed(
         self, body: Body, mixture: GaussianMixture, velocities: Array | None = None
     ) -> tuple[GaussianMixture, Array | None]:
-        """A mixture over poses of a body in the camera frame, and velocities (K, d), if known.
+        """Transform a mixture over poses in the camera frame, and velocities (K, d), if known.
 
         Returns:
-            Both in the frame `optical`, against whose axes root angles are measured. Means are
-            carried over exactly, covariances and velocities with the Jacobian at the means.
+            Both in the frame `optical`, with root angles relative to its axes. Means are
+            transformed exactly, covariances and velocities with the Jacobian at the means.
         """
         motion, upright = self.motion, body.levelled(np.eye(3))
         means = motion.free_poses(body, mixture.means, self.turn, upright)
@@ -72,7 +72,7 @@ class FixedFrame:
         return GaussianMixture(mixture.weights, means, covariances), velocities
 
     def turn_of(self, body: Body, pose: Array) -> float:
-        """The angle about z by which the root of a pose (d,) is turned, rad; see `turn`."""
+        """Return the change of the root's angle about z for a pose (d,), rad; see `turn`."""
         about_z = root_rotation_dofs(body.skeleton)[0]
         upright = body.levelled(np.eye(3))
         placed = self.motion.free_poses(body, pose[None], self.turn, upright)[0]
@@ -80,9 +80,9 @@ class FixedFrame:
 
 
 def upright(up: Array) -> Array:
-    """Rotation (3, 3) to a camera from the frame that looks its way with z up: x forward.
+    """Return the rotation (3, 3) to the camera frame from the frame with z up and x forward.
 
-    A camera that looks straight up or down has its upper edge for forward.
+    If the camera looks straight up or down, x points to the upper edge of the image.
 
     Args:
         up: (3,) unit vector against gravity, camera frame.

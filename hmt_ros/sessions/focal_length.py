@@ -1,13 +1,14 @@
-"""A focal length that is not calibrated, and the error of all depths that follows from it.
+"""Uncalibrated focal length, and the error of all depths that follows from it.
 
-An image gives the directions of the joints, and lengths of the body their distance: a focal length
-that is wrong by the factor 1 + e moves the person along the optical axis, and nothing else.
+An image gives the directions of the joints, and the lengths of the body give their distance: a
+focal length that is wrong by the factor 1 + e only moves the person along the optical axis.
 
     z ~ f    =>    C = S + (s z)^2 e_z e_z'            e_z: the depth of the root
 
-S is the covariance of a mode at depth z with the focal length as it is, s the relative standard
-deviation of the focal length. It errs alike in all images, so that no number of them lessens it: it
-is added to what is published, and enters no estimate (a consider covariance, [Schmidt 1966]).
+S is the covariance of a mode at depth z for the assumed focal length, s the relative standard
+deviation of the focal length. The error is the same in all images, and more images do not reduce
+it: it is added to published covariances and enters no estimate (a consider covariance,
+[Schmidt 1966]).
 """
 
 from __future__ import annotations
@@ -27,19 +28,19 @@ USUAL_FOV, USUAL_SIGMA = 60.0, 0.2
 
 
 def usual_camera(size: tuple[int, int], fov: float = USUAL_FOV) -> Camera:
-    """A camera with a field of view, degrees, along the longer side of images of a size, px."""
+    """Return a camera with a field of view, degrees, along the longer side of an image, px."""
     width, height = size
     return camera_of_view(size, fov) if width >= height else camera_of_view(size, vertical=fov)
 
 
 def depth_covariances(poses: Array, sigma: float) -> Array:
-    """Covariances (K, d, d) of poses (K, d) by the focal length, see the head of this file."""
+    """Return covariances (K, d, d) of poses (K, d) due to the focal length, see the module."""
     depth = np.arange(poses.shape[1]) == 2
     return np.multiply.outer((sigma * poses[:, 2]) ** 2, np.diag(depth).astype(np.float64))
 
 
 def with_depth_error(mixture: GaussianMixture, sigma: float) -> GaussianMixture:
-    """A mixture over poses in the frame of the camera, whose depths err with the focal length."""
+    """Add the depth error of the focal length to a mixture over poses in the camera frame."""
     if sigma == 0.0:
         return mixture
     added = depth_covariances(mixture.means, sigma)

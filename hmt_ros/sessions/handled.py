@@ -1,6 +1,6 @@
 """Reports of sessions: the outcome of each message, and counts over all of them.
 
-The kind of a fault, or of a remark, is a word or two, which name it in the diagnostics.
+The kind of a fault or a remark is its name in the diagnostics, a word or two.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class Output:
     """A message that is to be published.
 
     Attributes:
-        topic: one of those that the node publishes.
-        stamp_ns: of the image that it is about.
-        message: for whoever takes it as it is, and does not change it.
+        topic: a topic that the node publishes.
+        stamp_ns: stamp of the image that it is about, ns.
+        message: the message; receivers must not change it.
     """
 
     topic: str
@@ -39,11 +39,11 @@ class Output:
         return serialise(self.message)
 
     def __iter__(self) -> Iterator[Any]:
-        """Topic, stamp and bytes."""
+        """Iterate over topic, stamp and bytes."""
         return iter((self.topic, self.stamp_ns, self.data))
 
     def __eq__(self, other: object) -> bool:
-        """Whether topic, stamp and bytes are those of another."""
+        """Whether topic, stamp and bytes are equal."""
         return isinstance(other, Output) and tuple(self) == tuple(other)
 
     __hash__ = None  # type: ignore[assignment]
@@ -54,13 +54,13 @@ class Handled:
     """Outcome of a message.
 
     Attributes:
-        source: where it came from.
-        stamp_ns: of the message.
-        faults: of it, or of a message that waited for it; empty if it was used.
-        warnings: for the log: the first fault of each kind.
+        source: source of the message.
+        stamp_ns: stamp of the message, ns.
+        faults: faults of the message, or of a message that waited for it; empty if it was used.
+        warnings: warnings for the log: the first fault of each kind.
         published: (topic, stamp) of all messages that were published, in their order.
-        events: for the log of a node, and no faults: start and end of a track, say; not in the
-            message.
+        events: remarks for the log of a node that are no faults, for example the start of a track;
+            not part of hmt_msgs/Handled.
     """
 
     source: str
@@ -75,12 +75,12 @@ class HandlingLog:
     """Collects the report on the present message, and counts over all messages.
 
     Attributes:
-        counts: number of the messages that are estimated from: 'received', and of these 'skipped',
+        counts: numbers of messages that are estimated from: 'received', and of these 'skipped',
             'dropped' and keys of the session.
-        faults: number by kind.
-        last_fault: the newest; '' before the first.
-        held_up: input that the last dropped message waited for here; '' if dropped before.
-        prefix: start of all texts: the person that they are about.
+        faults: number of faults by kind.
+        last_fault: newest fault; '' before the first.
+        held_up: input that the last dropped message waited for; '' if it waited for its turn only.
+        prefix: prefix of all texts, which names the person that they are about.
     """
 
     def __init__(self) -> None:
@@ -104,38 +104,38 @@ class HandlingLog:
         self.note(kind, text)
 
     def note(self, kind: str, text: str, *, warn: bool = False) -> None:
-        """Warns of the first of a kind, and where `warn` says so; the others are counted."""
+        """Counts a remark; logs it if it is the first of its kind or `warn` is true."""
         self.faults[kind] += 1
         self.last_fault = one_line(f'{self.prefix}{text}')
         if warn or self.faults[kind] == 1:
             self._warned.append(self.last_fault)
 
     def tell(self, text: str) -> None:
-        """Logs something that is no fault."""
+        """Logs an event that is no fault."""
         self._events.append(one_line(f'{self.prefix}{text}'))
 
     def skip(self, kind: str, text: str) -> None:
-        """Reports a message that was to be estimated from and can not be used."""
+        """Reports a message that is estimated from and can not be used."""
         self.counts['skipped'] += 1
         self.fault(kind, text)
 
     def drop(self, text: str) -> None:
-        """Reports a message that is not estimated from because the node is late; no fault of it."""
+        """Reports a message that is dropped because the node is late; this counts as no fault."""
         self.counts['dropped'] += 1
         self.held_up = ''
         self._told.append(one_line(text))
 
     def count_dropped(self, messages: int) -> None:
-        """Counts messages that were dropped before they came here."""
+        """Counts messages that were dropped before they reached the session."""
         self.counts['received'] += messages
         self.counts['dropped'] += messages
         self.held_up = ''
 
     def give_up(self, kind: str, held_up: str, text: str) -> None:
-        """Reports a message that waited here in vain and is dropped.
+        """Reports a message that is dropped because an input did not come.
 
         Args:
-            held_up: input that it waited for.
+            held_up: input that the message waited for.
         """
         self.counts['dropped'] += 1
         self.held_up = held_up
@@ -146,7 +146,7 @@ class HandlingLog:
         self._published.append((topic, stamp_ns))
 
     def handled(self, source: str, stamp_ns: int) -> Handled:
-        """The report on the present message."""
+        """Return the report on the present message."""
         return Handled(
             source,
             stamp_ns,
@@ -158,7 +158,7 @@ class HandlingLog:
 
 
 def handled_message(messages: MessageFactory, handled: Handled) -> Any:
-    """hmt_msgs/Handled, which a node publishes on `~/handled`."""
+    """Return hmt_msgs/Handled, which a node publishes on `~/handled`."""
     return messages.create(
         HANDLED,
         source=handled.source,
@@ -171,7 +171,7 @@ def handled_message(messages: MessageFactory, handled: Handled) -> Any:
 
 
 def handled_of(message: Any) -> Handled:
-    """The content of an hmt_msgs/Handled, of `rosbags` or of ROS."""
+    """Return the content of an hmt_msgs/Handled of `rosbags` or of ROS."""
     published = zip(message.published_topics, message.published_stamps, strict=True)
     return Handled(
         source=str(message.source),

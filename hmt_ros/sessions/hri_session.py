@@ -1,16 +1,17 @@
-"""REP 155 behind its topics: mixtures of people in, bodies as robots expect them out.
+"""Session of the REP 155 bridge: mixtures of people in, bodies of REP 155 out.
 
 The rules, besides those of `Session`:
 
-- A track of a person is a body. Its identity is the name of the person, the namespace without
-  /humans/bodies/, and the number of the track: p1_2 is the second track in /humans/bodies/p1. A
-  person who is found again by a new track is a new body; no identity is used twice.
-- /humans/bodies/tracked lists the bodies that are tracked. A body that the filter calls lost is not
-  in the list until the same track goes on; it ends with the track, with a mixture without
-  components, and `LONGEST_SILENCE` after its last mixture.
-- A body is shown in one pose, its heaviest mode. While that mode lasts another one replaces it only
-  with twice its weight.
-- Regions, landmarks and cropped images need the calibrated camera_info of the frame of the mixture,
+- A track of a person is a body. Its identity consists of the name of the person (the namespace
+  without /humans/bodies/) and the number of the track: p1_2 is the second track in
+  /humans/bodies/p1. A person who is found again by a new track is a new body; no identity is used
+  twice.
+- /humans/bodies/tracked lists the bodies that are tracked. A body whose track is lost is not in the
+  list until the same track is found again. A body ends with its track, with a mixture without
+  components, or `LONGEST_SILENCE` after its last mixture.
+- A body is shown in one pose, its heaviest mode. Until that mode ends, another mode replaces it
+  only with more than twice its weight.
+- Regions, landmarks and cropped images need the calibrated camera_info of the frame of the mixture;
   frames and joint states do not. A cropped image needs the image of the stamp of the mixture.
 """
 
@@ -59,7 +60,7 @@ TOPICS = {
     TRACKED: PublishedTopic(IDS, latched=True),
     FRAMES: PublishedTopic('tf2_msgs/msg/TFMessage'),
 }
-# In the namespace of each body.
+# Topics in the namespace of each body.
 BODY_TOPICS = {
     'urdf': PublishedTopic('std_msgs/msg/String', latched=True),
     'joint_states': PublishedTopic('sensor_msgs/msg/JointState'),
@@ -68,47 +69,47 @@ BODY_TOPICS = {
     'cropped': PublishedTopic('sensor_msgs/msg/Image'),
 }
 MIXTURE = 'pose_mixture'
-# Least weight, relative to the heaviest mode, with which a mode stays on show.
+# Minimum weight of the shown mode relative to the heaviest mode.
 _KEPT = 0.5
-# Change of a length above which a body is described anew, m.
+# Maximum change of a joint's origin without a new URDF, m.
 _RESHAPED = 0.005
-# Time without a mixture after which a body is not tracked any more, by stamps of camera_info, s.
+# Time without a mixture after which a body ends, by the stamps of camera_info, s.
 LONGEST_SILENCE = 2.0
 # Number of people without a body who are remembered, for the numbers of their tracks.
 _REMEMBERED = 1000
-# A filter that is further behind drops images itself.
+# Number of images kept for cropping; a filter that is further behind drops images itself.
 _IMAGES = 20
 
 
 def mixture_source(namespace: str) -> str:
-    """Name of the source of the mixtures of a namespace."""
+    """Return the source name of the mixtures in a namespace."""
     return f'{MIXTURE} of {namespace}'
 
 
 def body_topic(identity: str, name: str) -> str:
-    """A topic of a body; `name` is one of `BODY_TOPICS`."""
+    """Return the topic of a body; `name` is one of `BODY_TOPICS`."""
     return f'{BODIES}/{identity}/{name}'
 
 
 def published_topic(topic: str) -> PublishedTopic:
-    """Type and durability of a topic of the session."""
+    """Return type and durability of a topic of the session."""
     return TOPICS.get(topic) or BODY_TOPICS[topic.rpartition('/')[2]]
 
 
 @dataclass
 class _Person:
-    """A person whose mixtures come in one namespace, and the body that is tracked there.
+    """The person of one namespace of mixtures, and the body that is tracked there.
 
     Attributes:
-        name: of the person.
-        identity: of the body; '' while there is none.
-        tracked: whether the body is neither lost nor silent.
-        track: number of its track; 0: it has none.
+        name: name of the person.
+        identity: identity of the body; '' while there is none.
+        tracked: whether the body is listed as tracked: it is neither lost nor ended.
+        track: number of the body's track; 0: unnumbered.
         bodies: number in the newest identity.
-        heard: time at which it came, by the stamps of camera_info, ns.
+        heard: time of the last mixture, by the stamps of camera_info, ns.
         mode: identity of the mode that is shown; 0: none.
-        angles: of the reference model in the image before.
-        described: joints of the model whose URDF was published.
+        angles: angles of the reference model in the previous image.
+        described: joints of the model whose URDF was published last.
     """
 
     name: str
@@ -122,17 +123,17 @@ class _Person:
     described: tuple[Joint, ...] = ()
 
     def end(self) -> None:
-        """The track has ended."""
+        """Ends the body."""
         self.identity, self.tracked = '', False
 
     def goes_on(self, track: int) -> bool:
-        """Whether the body of the last mixture is that of a track; 0: it has no number."""
+        """Whether the present body belongs to a track; 0 is an unnumbered track."""
         return bool(self.identity) and track == self.track
 
     def begin(self, track: int) -> None:
-        """A track goes on, or another one begins, whose number is larger than those before."""
+        """Continues the body of a track, or begins a new body with a larger number."""
         if not self.goes_on(track):
-            # A filter that was started again counts from 1 again.
+            # A restarted filter numbers its tracks from 1 again.
             self.bodies = max(track, self.bodies + 1)
             self.identity = f'{self.name}_{self.bodies}'
             self.mode, self.angles, self.described = 0, {}, ()
@@ -144,7 +145,7 @@ class HriState(SessionState):
     """State of the bridge: its status is 'waiting', 'nobody' or 'tracking'.
 
     Attributes:
-        bodies: that are tracked.
+        bodies: identities of the tracked bodies.
     """
 
     bodies: tuple[str, ...] = ()
@@ -177,7 +178,7 @@ class HriSession(Session[HriParameters, HriState]):
 
     @property
     def identities(self) -> set[str]:
-        """The bodies that have topics: those that are tracked, or lost but not given up."""
+        """Identities of the bodies that have topics: tracked, or lost and not ended."""
         return {person.identity for person in self._people.values() if person.identity}
 
     def needed_inputs(self) -> list[NeededInput]:
@@ -185,7 +186,7 @@ class HriSession(Session[HriParameters, HriState]):
         return [NeededInput((mixture_source(name),)) for name in self.parameters.named]
 
     def _end(self) -> int:
-        """Tells that nobody is tracked any more."""
+        """Publishes that nobody is tracked any more."""
         tracked = bool(self._tracked())
         self.restart()
         self._orders.clear()
@@ -195,7 +196,7 @@ class HriSession(Session[HriParameters, HriState]):
 
     def restart(self) -> None:
         """See `Session`."""
-        # The numbers of their bodies are not given again.
+        # People are kept, so that the numbers of their bodies are not used again.
         for person in self._people.values():
             person.end()
         self._images: dict[int, Any] = {}
@@ -214,7 +215,7 @@ class HriSession(Session[HriParameters, HriState]):
             self._take_mixture(source.removeprefix(mixture_source('')), message, stamp)
 
     def _take_camera_info(self, message: Any, stamp: int) -> None:
-        # One stray stamp does not end all bodies.
+        # One stray stamp must not end all bodies.
         if self._clock.put(Stamped(stamp, None), expected=False).use:
             self._now = self._clock.newest = stamp
         try:
@@ -275,7 +276,7 @@ class HriSession(Session[HriParameters, HriState]):
         """Publishes a body in its pose.
 
         Raises:
-            ValueError: joint positions that no person has.
+            ValueError: the joint positions are impossible for a person.
         """
         p, stamp = self.parameters, content.stamp_ns
         shown = _shown_mode(content, person.mode if person.goes_on(content.track_id) else 0)
@@ -327,7 +328,7 @@ class HriSession(Session[HriParameters, HriState]):
         shown: int,
         camera: Camera,
     ) -> None:
-        """Publishes messages that need the calibration; none of a body beyond the image."""
+        """Publishes the messages that need a calibration; none for a body outside of the image."""
         identity, stamp, frame = person.identity, content.stamp_ns, content.frame_id
         places, weights = content.joint_positions, content.weights
         region = region_in_image(camera, places[shown])
@@ -373,13 +374,13 @@ class HriSession(Session[HriParameters, HriState]):
 
 
 def _name_in(namespace: str) -> str:
-    """Name of a person, from the namespace of its mixtures."""
+    """Return the name of a person, from the namespace of the mixtures."""
     name = namespace.removeprefix(BODIES).strip('/').replace('/', '_')
     return name or 'body'
 
 
 def _shown_mode(content: PoseMixture, before: int) -> int:
-    """Index of the mode that is shown, where that of the identity `before` was; 0: none was."""
+    """Return the index of the mode to show; `before` is the identity shown before, or 0."""
     assert content.identities is not None
     heaviest = int(np.argmax(content.weights))
     for k in np.flatnonzero(content.identities == before) if before else ():
@@ -389,7 +390,7 @@ def _shown_mode(content: PoseMixture, before: int) -> int:
 
 
 def _alike(joints: tuple[Joint, ...], others: tuple[Joint, ...]) -> bool:
-    """Whether two models have the same joints, up to small changes of their lengths."""
+    """Whether two models have the same joints, up to small changes of their origins."""
     if [joint.name for joint in joints] != [joint.name for joint in others]:
         return False
     pairs = zip(joints, others, strict=True)

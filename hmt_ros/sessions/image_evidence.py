@@ -1,4 +1,4 @@
-"""What a likelihood mixture says of an image, for a smoother: evidence, and the filter's chain."""
+"""Evidence of an image, and the chain of the filter's modes, from a likelihood mixture."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from msg_tools import MessageError
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture
 
-# Mean speed of the joints, seen from the pelvis, that is within reach of a body, m/s, and what
-# modes of two images differ by besides, m: where no filter tells which mode continues which.
+# Maximum mean speed of the joints relative to the pelvis, m/s, and additional distance of modes of
+# two images, m: together the reach of a mode whose ancestry is unknown.
 FASTEST, TREMBLE = 2.0, 0.05
 
 
@@ -26,9 +26,9 @@ class Evidence(NamedTuple):
     """Evidence of an image about the pose.
 
     Attributes:
-        modes: the whole evidence, with the weights and the ancestry of the filter's modes.
+        modes: mixture of the evidence, with the weights and the ancestry of the filter's modes.
         shape: (d, d) covariance of the errors shared by poses of all images; None: unknown.
-        identities: (K,) of the modes in the filter; 0: none.
+        identities: (K,) identities of the modes in the filter; 0: none.
     """
 
     modes: ImageModes
@@ -37,11 +37,11 @@ class Evidence(NamedTuple):
 
 
 class KeptMixtures(NamedTuple):
-    """Likelihoods that have been smoothed since the window began, the newest.
+    """Newest likelihoods that have been smoothed since the window began.
 
     Attributes:
-        of: person of the poses; None: no mixture has come.
-        items: as they were received.
+        of: person of the poses; None before the first mixture.
+        items: evidence of the likelihoods, oldest first.
     """
 
     of: SmoothedBody | None
@@ -49,14 +49,14 @@ class KeptMixtures(NamedTuple):
 
 
 def evidence_of(content: PoseMixture) -> Evidence:
-    """The evidence in a mixture, with its error model; without one, errors do not last.
+    """Return the evidence in a mixture; without an error model, errors are independent.
 
-    Where the publisher does not tell the weights of the modes in its posterior, those of the
-    mixture are taken for them. The modes continue nothing yet, see `continued`.
+    If the posterior weights of the modes are not given, the weights of the mixture replace them.
+    The modes have no ancestry yet, see `continued`.
 
     Raises:
-        MessageError: there are no components or no covariances; a forecast; a likelihood without an
-            error model.
+        MessageError: the mixture has no components or no covariances, is a forecast, or is a
+            likelihood without an error model.
     """
     if content.kind is MixtureKind.FORECAST:
         raise MessageError(
@@ -81,14 +81,15 @@ def evidence_of(content: PoseMixture) -> Evidence:
 def continued(
     evidence: Evidence, content: PoseMixture, before: Evidence, points: Array, points_before: Array
 ) -> Evidence:
-    """The evidence of an image whose modes continue those of the image before.
+    """Return the evidence of an image with its modes linked to those of the previous image.
 
     Args:
-        evidence: of the image.
-        content: of its message, with the ancestry that the filter tells.
-        before: evidence of the image before.
-        points, points_before: (K, P, 3) and (M, P, 3) of the modes of both, m; where ancestry is
-            unknown, or refers to an image that has not come, a mode may continue all within reach.
+        evidence: evidence of the image.
+        content: content of its message, with the ancestry by the filter.
+        before: evidence of the previous image.
+        points, points_before: (K, P, 3) and (M, P, 3) points of the modes of both images, m. They
+            are used if the ancestry is unknown or refers to an image that has not come: a mode
+            may then continue all modes within reach.
     """
     modes, others = evidence.modes, before.modes
     ancestry, known = content.ancestry, content.ancestry_stamp_ns == others.stamp_ns

@@ -1,12 +1,12 @@
-"""Inputs that come with the images of a camera, declared once, and those that wait for an image.
+"""Inputs that accompany the images of a camera: their table, and the inputs that wait for an image.
 
-`INPUTS` is the table: topics and types, reading of messages, waiting of images for them, faults of
-their absence. Sessions, nodes, replay and recording read it; a new input is a row here, the
-parameter that switches it on, and the place where its content is used.
+`INPUTS` is the table of topics, types, readers, the parameters that make images wait for an input,
+and reports of missing inputs. Sessions, nodes, replay and recording use it. A new input needs a row
+here, a parameter that enables it, and code that uses its content.
 
-An input belongs to the image of exactly its stamp; of several of one stamp the last counts. Where
-its parameter says so an image waits for it: for the input of its stamp, for one of a later stamp,
-or for an image that is `input_timeout` younger. One that can not be used counts as none.
+An input belongs to the image of exactly its stamp; of several with one stamp the last counts. If
+its parameter is true, an image waits for the input of its stamp, for an input of a later stamp, or
+for an image that is `input_timeout` younger. An unusable input counts as an empty one.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SOURCES = {
 
 T = TypeVar('T')
 
-# Inputs that are remembered, those as large as images, and bytes of one.
+# Maximum numbers of small and of image-sized inputs that wait; maximum sizes of a message, bytes.
 REMEMBERED, FEWER = 256, 64
 LARGEST, LARGEST_MASK, LARGEST_DEPTH = 2**24, MAX_PIXELS + 2**16, 4 * MAX_PIXELS + 2**16
 
@@ -50,17 +50,17 @@ class ImageInput:
     """An input: a row of the table.
 
     Attributes:
-        name: of the input.
-        types: type of its messages, by source; a source is the name of its topic, too.
-        parameter: name of the one that is true where images wait for it; '': they always do.
-        read: content of a message of a stamp, None where it says that there is nothing; raises
-            ValueError, in one line, where it can not be used.
-        told: whether an image without one, and one that belongs to no image, are reported.
-        pixels: remedy, maybe '', where its size is not that of its image; None: it has no pixels.
-        remembered: maximum number kept of stamps whose image has not come.
-        largest: size of the largest message that is taken, bytes.
-        reliable: whether none may be lost on its way.
-        together: whether those of images before stay, to be used with the next.
+        name: name of the input.
+        types: types of its messages, by source; the source is also the name of the topic.
+        parameter: name of the parameter that makes images wait for the input; '': they always do.
+        read: returns the content of a message with a stamp, None if it is empty; raises ValueError,
+            in one line, if the message can not be used.
+        told: whether an image without the input, and an input without an image, are reported.
+        pixels: remedy, possibly '', if its size differs from the image's; None: it has no pixels.
+        remembered: maximum number of inputs that wait for their image.
+        largest: maximum size of a message, bytes.
+        reliable: whether no message may be lost in transit.
+        together: whether inputs of earlier images are kept and used with the next image.
     """
 
     name: str
@@ -75,7 +75,7 @@ class ImageInput:
     together: bool = False
 
     def is_used(self, parameters: Any) -> bool:
-        """Whether images wait for it, by the parameters of a node."""
+        """Whether images wait for the input, by the parameters of a node."""
         return not self.parameter or bool(getattr(parameters, self.parameter, False))
 
 
@@ -138,7 +138,7 @@ PREDICTION_INPUT = ImageInput(
     reliable=True,
     together=True,
 )
-# Its type depends on the parameter `source`.
+# The type depends on the parameter `source`.
 DETECTIONS_INPUT = ImageInput(
     DETECTIONS,
     {DETECTIONS: ''},
@@ -153,12 +153,12 @@ INPUTS = (MASK_INPUT, KEYPOINTS_INPUT, KEYPOINTS_3D_INPUT, DEPTH_INPUT, PREDICTI
 class StampedInputs(Generic[T]):
     """Inputs that belong to the image of exactly their stamp; of several the last counts.
 
-    None stands for an input without content, as of a detector that saw nobody.
+    None represents an input without content, for example of a detector that saw nobody.
     """
 
     def __init__(self, most: int = REMEMBERED) -> None:
         self._most = most
-        # In the order in which they came.
+        # Contents by stamp, in the order of arrival.
         self._content: dict[int, T | None] = {}
 
     def keep(self, first_ns: int, last_ns: int) -> None:
@@ -173,20 +173,20 @@ class StampedInputs(Generic[T]):
             del self._content[next(iter(self._content))]
 
     def is_settled(self, stamp_ns: int, within_ns: float) -> bool:
-        """Whether the input for an image has come, or one that is later by no more than a time.
+        """Whether the input for an image has come, or one that is later by at most a time.
 
-        One that is far ahead says nothing of the images until then.
+        An input further ahead does not show that the one of the image is missing.
         """
         return any(0 <= each - stamp_ns <= within_ns for each in self._content)
 
     def take_all(self, stamp_ns: int) -> dict[int, T | None]:
-        """The inputs by stamp, in order, for an image and all that are older; drops them."""
+        """Remove and return the inputs for an image and all older ones, in the order of stamps."""
         taken = sorted(stamp for stamp in self._content if stamp <= stamp_ns)
         return {stamp: self._content.pop(stamp) for stamp in taken}
 
 
 class ImageInputs:
-    """Inputs that have come for the images of a session."""
+    """Inputs that wait for the images of a session."""
 
     def __init__(self, rows: Iterable[ImageInput], log: HandlingLog) -> None:
         self._log = log
@@ -196,18 +196,18 @@ class ImageInputs:
         }
 
     def __getitem__(self, name: str) -> StampedInputs[Any]:
-        """The messages of an input that wait."""
+        """Return the waiting contents of an input."""
         return self._waiting[name]
 
     def row(self, source: str) -> ImageInput | None:
-        """The input that a source belongs to; None: to none."""
+        """Return the input that a source belongs to; None if it is no input."""
         return self._rows.get(source)
 
     def put(self, source: str, message: Any, stamp_ns: int, read: Callable[..., Any]) -> None:
         """Reads a message and keeps its content for its image.
 
         Args:
-            read: as `ImageInput.read`.
+            read: reader like `ImageInput.read`.
         """
         row, content = self._rows[source], None
         try:
@@ -217,14 +217,14 @@ class ImageInputs:
         self._waiting[row.name].put(stamp_ns, content)
 
     def take(self, row: ImageInput, stamp_ns: int, image: Image, dropped: Container[int]) -> Any:
-        """The input for an image; reports a missing one, and those that belong to no image.
+        """Return the input for an image; report a missing input, and inputs without an image.
 
         Args:
             image: (H, W, 3).
-            dropped: stamps of images that were dropped, whose inputs are not missed.
+            dropped: stamps of dropped images; their inputs are not reported.
 
         Returns:
-            Content of its stamp; None: no message, or one without content.
+            Content for the image; None if there is no message, or one without content.
         """
         taken = self._waiting[row.name].take_all(stamp_ns)
         content = taken.get(stamp_ns)

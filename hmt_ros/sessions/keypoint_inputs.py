@@ -1,15 +1,15 @@
 """Keypoints of the person who is tracked, from messages of any detector.
 
-The parameter `source` gives the kind of messages: hmt_msgs/Keypoints2D of one person, or those of
-other detectors, of one person or of several:
+The parameter `source` selects the type of messages: hmt_msgs/Keypoints2D of one person, or messages
+of other detectors on one person or several:
 
-- Skeleton2D is in units of the image: it needs a camera_info before. Its topic belongs to one
-  person already. Float32MultiArray without a stamp has that of the newest camera_info.
-- One of several people is chosen: by `person_id`, or the largest at first, and then the one who is
-  nearest to the last place.
+- Skeleton2D is in units of the image size and needs an earlier camera_info. Its topic belongs to
+  one person. Float32MultiArray without a stamp takes the stamp of the newest camera_info.
+- One of several people is chosen by `person_id`. Without it, the largest person is chosen at first,
+  and then the person nearest to the last position.
 
-Keypoints without names say that nobody was seen. Positions in space join the keypoints of their
-stamp by name.
+Keypoints without names mean that nobody was seen. Positions in space are added to the keypoints of
+their stamp by name.
 """
 
 from __future__ import annotations
@@ -42,28 +42,28 @@ from msg_tools.messages.detections import (
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.keypoints import Positions, keypoints_of
 
-# Value of `source` for the messages of one person, in units of the image.
+# Value of `source` for messages of one person, in units of the image size.
 SKELETON = 'skeleton2d'
-# Time without the person after which the largest one is chosen anew, s.
+# Time without the person after which the largest person is chosen again, s.
 LONGEST_ABSENCE = 1.0
-# Largest motion of a person between two images, in sizes of the person.
+# Maximum motion of a person between two images, relative to the size of the person.
 _FARTHEST = 1.0
-# Factor per image on the size of a person who is partly hidden now.
+# Decay factor per image of the remembered size of a person, who may be partly hidden.
 _SIZE_KEPT = 0.95
 
 
 def known_lifter(model: str) -> Lifter | None:
-    """The experts that a parameter `lifter` names; None: it is empty.
+    """Load the lifter that the parameter `lifter` names; None if the name is empty.
 
     Raises:
-        ValueError: there is no such file, or it is no lifter; one line.
+        ValueError: the file does not exist, or is not a lifter; one line.
     """
     with named_file('lifter', model, 'lifter'):
         return load_lifter(model) if model else None
 
 
 def keypoints_input(source: str) -> ImageInput:
-    """The input of keypoints with messages of a `source`."""
+    """Return the input of keypoints for a value of `source`."""
     if source == OWN_KEYPOINTS:
         return KEYPOINTS_INPUT
     return replace(KEYPOINTS_INPUT, types={DETECTIONS: SOURCES[source]})
@@ -79,7 +79,7 @@ def _person_of_skeleton(
     return [person_of_skeleton(message, camera.width, camera.height)]
 
 
-# The people in a message, by the parameter `source`.
+# Readers of the people in a message, by the parameter `source`.
 _READERS: dict[str, Callable[[Any, Scheme, Camera | None], list[DetectedPerson]]] = {
     'people': lambda message, _order, _camera: people_of_message(message),
     'boxes': lambda message, _order, _camera: people_of_boxes(message),
@@ -90,10 +90,10 @@ _READERS: dict[str, Callable[[Any, Scheme, Camera | None], list[DetectedPerson]]
 
 
 class ChosenPerson:
-    """The person who is followed: at first the largest, then the nearest to the last place.
+    """Chooses the person to follow: the largest at first, then the nearest to the last position.
 
-    The place is that of the detections themselves, so that the choice does not depend on the
-    tracker, which may be lost.
+    The position is that of the detections, so that the choice does not depend on the tracker, whose
+    track may be lost.
     """
 
     def __init__(self) -> None:
@@ -102,19 +102,19 @@ class ChosenPerson:
         self._size = 0.0
 
     def forget(self) -> None:
-        """The next choice is the largest person."""
+        """Forgets the person: the next choice is the largest person."""
         self._last = None
 
     def choose(
         self, people: Sequence[DetectedPerson], stamp_ns: int, longest_absence: float
     ) -> Keypoints | None:
-        """The person among those who were seen in an image.
+        """Choose the person among the people who were seen in an image.
 
         Args:
-            longest_absence: time after which the largest person is chosen anew, s.
+            longest_absence: time after which the largest person is chosen again, s.
 
         Returns:
-            The keypoints; None: the person is not among them.
+            The keypoints; None if the person is not among them.
         """
         seen = [person.keypoints for person in people if person.keypoints.seen.any()]
         if not seen:
@@ -133,13 +133,13 @@ class ChosenPerson:
 
 
 def _size(keypoints: Keypoints) -> float:
-    """Diagonal of the box around a person, px."""
+    """Return the diagonal of the box around a person, px."""
     pixels = keypoints.pixels[keypoints.seen]
     return float(elementary.hypot(*np.ptp(pixels, axis=0)))
 
 
 def _distance(one: Keypoints, other: Keypoints) -> float:
-    """Median distance of the landmarks that both have; else that of their middles, px."""
+    """Return the median distance of shared landmarks, or else the distance of the centres, px."""
     both = one.seen & other.seen
     if both.any():
         return float(np.median(elementary.hypot(*(one.pixels - other.pixels)[both].T)))
@@ -160,14 +160,14 @@ class DetectionReader:
     def _people(
         self, message: Any, stamp: int, order: Scheme, camera: Camera | None = None
     ) -> list[DetectedPerson]:
-        """The people in a message.
+        """Return the people in a message.
 
         Args:
-            order: of keypoints that come without names.
-            camera: that took the image; None: it is not known.
+            order: scheme of keypoints without names.
+            camera: camera of the image; None: unknown.
 
         Raises:
-            MessageError: it can not be used.
+            MessageError: the message can not be used.
         """
         try:
             return _READERS[self._source](message, order, camera)
@@ -175,7 +175,7 @@ class DetectionReader:
             raise MessageError(f'detections of {stamp} ns: {error}') from error
 
     def _report(self, unknown: list[str], scheme: str) -> None:
-        """Counts names of keypoints that are not known."""
+        """Reports unknown names of keypoints."""
         known = {AUTO: 'of the body or of a known scheme', JOINTS: 'of the body'}
         self._log.note(
             'names of keypoints',
@@ -188,7 +188,7 @@ class KeypointReader(DetectionReader):
     """Reads the keypoints of the person who is tracked.
 
     Attributes:
-        chosen: one of several people.
+        chosen: the choice among several people.
     """
 
     def __init__(self, source: str, log: HandlingLog) -> None:
@@ -203,13 +203,13 @@ class KeypointReader(DetectionReader):
         body: Body,
         camera: Camera | None,
     ) -> Keypoints:
-        """The keypoints in a message.
+        """Return the keypoints in a message.
 
         Args:
-            camera: that took the image; None: it is not known yet.
+            camera: camera of the image; None: not known yet.
 
         Raises:
-            ValueError: it can not be used; one line.
+            ValueError: the message can not be used; one line.
         """
         found = self._found(message, stamp, parameters, camera)
         if found is None or not found.names:
@@ -249,11 +249,11 @@ class KeypointReader(DetectionReader):
         scheme: str,
         stamp_ns: int,
     ) -> Keypoints | None:
-        """The keypoints that were seen in an image, maybe none, as joints of the body.
+        """Return the keypoints that were seen in an image, possibly none, as joints of the body.
 
         Args:
-            found: as read; None: none have come.
-            positions: of the same landmarks in space; None: none have come.
+            found: keypoints as read; None if no message has come.
+            positions: positions of the landmarks in space; None if no message has come.
         """
         if found is None or not found.names:
             return found

@@ -1,10 +1,11 @@
-"""A detector of keypoints behind its topics: images in, keypoints of one person or several out.
+"""Session of the keypoint detector: images in, keypoints of one person or several out.
 
-- With `people` above 0 every image that can be used gets one detections, with all people and their
-  identities, and nothing else. Otherwise it gets one keypoints, one keypoints_3d and, with
-  `publish_mask`, one mask. Messages without names, and a mask of zeros, say that nobody was seen.
-- All have the stamp and the frame of the image.
-- What can not be used is skipped. The first fault of each kind is logged; all are counted.
+- With `people` above 0 every usable image gets one message on detections, with all people and their
+  identities, and no other message. Otherwise it gets one message on keypoints, one on keypoints_3d
+  and, with `publish_mask`, one on mask. Messages without names, and a mask of zeros, mean that
+  nobody was seen.
+- All messages have the stamp and the frame of the image.
+- Unusable images are skipped. The first fault of each kind is logged; all are counted.
 """
 
 from __future__ import annotations
@@ -79,11 +80,11 @@ class KeypointsParameters(ImageNodeParameters):
 class KeypointsState(SessionState):
     """State of the detection: its status is 'waiting', 'nobody' or 'detecting'.
 
-    Of the counts 'detected' are images with or without somebody, 'empty' those without.
+    The count 'detected' is of images with or without a person, 'empty' of images without one.
 
     Attributes:
-        landmarks: number of those that were found in the last image, of all people.
-        people: number of them; None: only one is looked for.
+        landmarks: number of landmarks of all people in the last image.
+        people: number of people in the last image; None if the detector finds only one person.
     """
 
     landmarks: int = 0
@@ -102,7 +103,7 @@ class KeypointsState(SessionState):
 
 
 class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
-    """Detects the keypoints of one person; see `Session` for arguments and attributes."""
+    """Detects the keypoints of people; see `Session` for arguments and attributes."""
 
     TOPICS = TOPICS
     COUNTED = IMAGE
@@ -121,7 +122,7 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
 
     def restart(self) -> None:
         """See `Session`."""
-        # The detector sees by the stamps that a new sequence begins.
+        # The detector recognises from the stamps that a new sequence begins.
         self._landmarks: int | None = None
         self._count: int | None = None
         super().restart()
@@ -188,7 +189,7 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
 
 
 def detected_people(seen: Sequence[SeenPerson]) -> list[DetectedPerson]:
-    """People as a message holds them."""
+    """Convert people for a message."""
     result = []
     for one in seen:
         left, top, right, bottom = one.corners.ravel().tolist()

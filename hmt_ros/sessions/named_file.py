@@ -1,7 +1,7 @@
-"""Files that parameters name: where they may lie, and what is told of one that can not be used.
+"""Files that parameters name: their allowed folders, and errors that do not reveal content.
 
-Whoever sets a parameter of a node over ROS need not be allowed to read files there. What such a
-reader may know of a file is its place and the kind of the fault, never its content.
+A client that sets a parameter of a node over ROS may have no right to read files there. A public
+error has the path of the file and the kind of the fault, never its content.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hmt_ros.body import model_names
 from hmt_ros.experts import lifter, pose_predictor
 from msg_tools.files.error_line import error_line, one_line
 
-# Parameters that may name a file, and the names in each that are no files.
+# Parameters that may name a file, and for each the names that are not files.
 FILES: Mapping[str, Callable[[], Collection[str]]] = {
     'subject_file': tuple,
     'background_file': tuple,
@@ -30,7 +30,7 @@ class NamedFileError(ValueError):
     """A file that a parameter names and that can not be used.
 
     Attributes:
-        public: parameter, path and kind of the fault; the text itself may quote the file.
+        public: parameter, path and kind of the fault; the text of the error may quote the file.
     """
 
     def __init__(self, text: str, public: str) -> None:
@@ -40,7 +40,7 @@ class NamedFileError(ValueError):
 
 @contextmanager
 def named_file(parameter: str, path: str, wanted: str) -> Iterator[None]:
-    """Whatever goes wrong while the file of a parameter is read is a `NamedFileError`.
+    """Turns any exception while the file of a parameter is read into a `NamedFileError`.
 
     Args:
         wanted: kind of the file, in words.
@@ -48,7 +48,7 @@ def named_file(parameter: str, path: str, wanted: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        # Readers of files from outside may fail in any way.
+        # Readers may raise any exception on a file from outside.
         text = error_line(error)
         if not isinstance(error, ValueError):
             text = f'{parameter} {path}: {text}'
@@ -56,18 +56,18 @@ def named_file(parameter: str, path: str, wanted: str) -> Iterator[None]:
 
 
 def public_line(error: BaseException) -> str:
-    """The text of an error as one line, without anything that a file holds."""
+    """Return the text of an error as one line, without the content of a file."""
     return one_line(error.public) if isinstance(error, NamedFileError) else error_line(error)
 
 
 def check_place(parameter: str, path: str, folders: Collection[str]) -> None:
-    """Whether a parameter may name a file.
+    """Checks that a parameter may name a file.
 
     Args:
-        folders: in which it must lie, once links are followed.
+        folders: folders that may contain the file, after links are resolved.
 
     Raises:
-        ValueError: it lies elsewhere, whether or not it exists, or is no regular file.
+        ValueError: the file is elsewhere, whether or not it exists, or is not a regular file.
     """
     names = ['', *FILES[parameter]()]
     if path in names:
@@ -88,7 +88,7 @@ def check_place(parameter: str, path: str, folders: Collection[str]) -> None:
 
 
 def _fault(error: BaseException | None, wanted: str) -> str:
-    """The kind of a fault, with the line where a text is not YAML."""
+    """Return the kind of a fault, with the line number if a text is not YAML."""
     while error is not None:
         if (mark := getattr(error, 'problem_mark', None)) is not None:
             return f'not a {wanted}: line {mark.line + 1} is not YAML'

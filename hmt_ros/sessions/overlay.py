@@ -1,7 +1,7 @@
-"""The modes of a mixture, drawn as skeletons on the image that they explain, and notes for a user.
+"""Overlay on an image: the modes of a mixture as skeletons, and notes for a user.
 
-Colours are those of the markers: the heaviest mode orange, the others blue, the lighter the
-fainter. The same modes on the same image give the same picture.
+Colours are those of the markers: the heaviest mode is orange, the others are blue, and modes of
+less weight are fainter. The same modes on the same image give the same picture.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _FIRST, _OTHERS = (13, 115, 230), (204, 115, 26)  # BGR
 _FAINTEST = 0.2
 _SHIFT = 4  # fractional bits of coordinates
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-_FAR = 2.0**14  # px; OpenCV draws nothing that begins further away
+_FAR = 2.0**14  # maximum coordinate, px; OpenCV draws no line that begins further away
 
 
 def draw_modes(
@@ -29,13 +29,13 @@ def draw_modes(
     weights: Array,
     count: int,
 ) -> Image:
-    """A copy of an image with the heaviest modes on it.
+    """Draw the heaviest modes on a copy of an image.
 
     Args:
         image: (H, W, 3) BGR.
         joints: (K, J, 3) joint positions of the modes, camera frame, m.
         bones: pairs of joints that are connected.
-        weights: (K,).
+        weights: (K,) weights of the modes.
         count: maximum number of modes that are drawn.
     """
     result = image.copy()
@@ -45,7 +45,7 @@ def draw_modes(
     thickness = max(round(min(image.shape[:2]) / 240), 1)
     pixels = camera.project(joints[order])
     usable = np.logical_and.reduce(np.abs(np.nan_to_num(pixels, nan=np.inf)) < _FAR, axis=2)
-    # The heaviest last, on top.
+    # The heaviest mode is drawn last, on top.
     for rank in reversed(range(len(order))):
         lines = [(a, b) for a, b in bones if usable[rank, a] and usable[rank, b]]
         ends = pixels[rank, sorted({joint for line in lines for joint in line})]
@@ -73,12 +73,12 @@ def draw_modes(
 
 
 def draw_notes(image: Image, notes: Sequence[str]) -> Image:
-    """A copy of an image (H, W, 3) with lines of text at its lower left, light on dark."""
+    """Draw lines of text at the lower left of a copy of an image (H, W, 3), light on dark."""
     result = image.copy()
     height, width = image.shape[:2]
     bottom = height
     for note in reversed(notes):
-        # At most as wide as the image.
+        # The text is at most as wide as the image.
         (wide, _), _ = cv2.getTextSize(note, _FONT, 1.0, 1)
         scale = min(max(height / 700.0, 0.35), 0.95 * width / max(wide, 1))
         top = bottom - round(36 * scale)
@@ -91,7 +91,7 @@ def draw_notes(image: Image, notes: Sequence[str]) -> Image:
 
 
 def _box(pixels: Array, margin: int, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of the part of an image that some points lie in."""
+    """Return left, top, right and bottom of the part of an image that contains some points."""
     if len(pixels) == 0:
         return 0, 0, 0, 0
     low = np.floor(pixels.min(0)).astype(int) - margin

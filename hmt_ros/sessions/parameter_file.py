@@ -16,7 +16,7 @@ LARGEST_FILE = 250_000  # bytes
 
 
 def yaml_scalar(value: Value) -> str:
-    """A value as YAML that the parser of ROS reads as the same type."""
+    """Format a value as YAML that the parser of ROS reads as the same type."""
     if isinstance(value, str):
         return "'" + value.replace("'", "''") + "'"
     if isinstance(value, list | tuple):
@@ -25,16 +25,16 @@ def yaml_scalar(value: Value) -> str:
 
 
 def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -> dict[str, Any]:
-    """Values by name, dots between groups, of the parameters that a file gives a node.
+    """Read the parameters that a file gives a node, by name, with dots between groups.
 
-    Sections for other nodes are passed over; a file may also hold the parameters alone, without
+    Sections for other nodes are ignored; a file may also have the parameters alone, without
     sections.
 
     Args:
-        by_name: whether only sections count that name the node, not those for all nodes.
+        by_name: whether to use only the sections that name the node, not those for all nodes.
 
     Raises:
-        ValueError: not such a file; one line that says why.
+        ValueError: the file is not a parameter file; one line with the reason.
     """
     path = Path(path)
     try:

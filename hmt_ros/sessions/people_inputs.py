@@ -1,4 +1,4 @@
-"""The people in the messages of a detector, as joints of the body and places in the image."""
+"""The people in the messages of a detector, as joints of the body and positions in the image."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class Found:
     """A person in the detections of an image.
 
     Attributes:
-        detected: as the detector says.
-        keypoints: at joints of the body, those that were seen.
-        sighting: where the person is in the image.
+        detected: person as detected.
+        keypoints: keypoints that were seen, at joints of the body.
+        sighting: position of the person in the image.
     """
 
     detected: DetectedPerson
@@ -37,7 +37,7 @@ class Found:
 
     @property
     def suffices(self) -> bool:
-        """Whether this is enough to follow somebody."""
+        """Whether the detection is enough to start a track."""
         return self.detected.box is not None or len(self.keypoints.names) >= FEWEST_KEYPOINTS
 
 
@@ -45,7 +45,7 @@ class PeopleReader(DetectionReader):
     """Reads the detections of several people.
 
     Args:
-        parameters: `source` and `keypoint_scheme` say how.
+        parameters: parameters of the node; only `source` and `keypoint_scheme` are used.
     """
 
     def __init__(self, parameters: PeopleParameters, log: HandlingLog) -> None:
@@ -53,10 +53,10 @@ class PeopleReader(DetectionReader):
         self._order = parameters.order
 
     def people(self, message: Any, stamp: int) -> list[DetectedPerson]:
-        """The people in a message.
+        """Return the people in a message.
 
         Raises:
-            MessageError: it can not be used.
+            MessageError: the message can not be used.
         """
         people = self._people(message, stamp, self._order)
         names: set[str] = set()
@@ -74,10 +74,10 @@ class PeopleReader(DetectionReader):
     def found(
         self, people: Sequence[DetectedPerson], body: Body, scheme: str, *, use_keypoints: bool
     ) -> list[Found]:
-        """The people who are at least partly visible.
+        """Return the people who are at least partly visible.
 
         Args:
-            use_keypoints: whether they are used for more than boxes.
+            use_keypoints: whether keypoints are used for more than the extent of a person.
         """
         result = []
         for person in people:

@@ -3,14 +3,14 @@
 The rules, besides those of `CameraSession`:
 
 - An image waits for its detections (`image_inputs`).
-- Identities of the detector are kept. People without one are told apart by their last place
+- Identities of the detector are kept. People without one are distinguished by their last position
   and motion (`hmt_ros.image.association`).
-- A detection that matches nobody who is followed starts a track, the largest first, up to
+- A detection that matches no followed person starts a track, the largest first, up to
   `max_people`. A person without a track, or no longer in view (`Tracker.status`), is dropped.
-- The nearest person is tracked first. For each person the pixels of nearer people are unknown, and
-  the pixels that only somebody farther away covers (`Tracker.step`, others).
+- The nearest person is tracked first. For each person, pixels that a nearer person covers, or that
+  only a farther person covers, are unknown (`Tracker.step`, others).
 - The background is learned while nobody is detected, or read from `background_file`.
-- With every image whose detections are known a list of the people who are tracked goes out, and
+- With every image whose detections are known, a list of the tracked people is published, and
   markers and an overlay with all of them.
 """
 
@@ -74,20 +74,20 @@ PEOPLE, MARKERS, OVERLAY = 'people', 'markers', 'overlay/compressed'
 
 
 def published_topic(topic: str) -> PublishedTopic:
-    """Type and durability of a topic of the node or of a person."""
+    """Return type and durability of a topic of the node or of a person."""
     if topic in PeopleSession.TOPICS:
         return PeopleSession.TOPICS[topic]
     return TOPICS_OF_NODE[topic.removeprefix(f'{BODIES}/{person_of(topic)}/')]
 
 
 def session_of(parameters: FilterParameters) -> type[TrackingSession]:
-    """The class of the session that tracks with these parameters."""
+    """Return the class of the session that tracks with these parameters."""
     return PeopleSession if isinstance(parameters, PeopleParameters) else TrackingSession
 
 
-# Least size in the image, px, of a person who is tracked.
+# Minimum size in the image of a person who is tracked, px.
 SMALLEST = 4
-# Time, s, after which a person who is no longer detected and has no track yet is forgotten.
+# Time after which a person who has no track and is no longer detected is dropped, s.
 UNSTARTED = 0.5
 
 
@@ -96,8 +96,8 @@ class PeopleState(CameraState):
     """State of the node: its status is 'no camera', 'waiting', 'nobody' or 'tracking'.
 
     Attributes:
-        people: identities of those who are tracked.
-        followed: identities of those who are tracked, or about to be.
+        people: identities of the people who are tracked.
+        followed: identities of the people who are tracked or whose track has not begun yet.
         detected: number of people in the last detections.
     """
 
@@ -115,15 +115,15 @@ class PeopleState(CameraState):
 
 
 class _Person(Track):
-    """Somebody who is followed; see `Track`.
+    """A person who is followed; see `Track`.
 
     Args:
-        found: where the person is seen first.
-        stamp: of that image, ns.
+        found: first detection of the person.
+        stamp: stamp of its image, ns.
 
     Attributes:
-        known_as: identity that the detector gives; '' if it gives none.
-        place: where the person was last detected.
+        known_as: identity from the detector; '' if it has none.
+        place: track of the person's detections in the image.
     """
 
     def __init__(self, found: Found, stamp: int, *track: Any) -> None:
@@ -141,7 +141,7 @@ class _Person(Track):
         )
 
     def area(self, camera: Camera, shift: Array | None = None) -> Mask | None:
-        """Where likely modes have the body (H, W), moved by a shift (2,) px; None: no track."""
+        """Pixels (H, W) of the body in likely modes, shifted by (2,) px; None without a track."""
         if not self.begun or self.tracker is None:
             return None
         modes = self.tracker.estimate.modes
@@ -154,7 +154,7 @@ class _Person(Track):
         """Pixels (H, W) that the person is expected to cover.
 
         Args:
-            one: the detection of the person in the image; None: there is none.
+            one: detection of the person in the image; None if not detected.
         """
         shift = self.place.shift(stamp)
         if one is not None and self.begun and self.tracker is not None:
@@ -170,7 +170,7 @@ class _Person(Track):
 class PeopleSession(TrackingSession):
     """Tracks several people; see `TrackingSession` for arguments and attributes."""
 
-    # Each person has those of `track_messages` besides, with the prefix of `track`.
+    # Each person also has the topics of `track_messages`, with the prefix of `track`.
     TOPICS: ClassVar[Mapping[str, PublishedTopic]] = {
         PEOPLE: PublishedTopic(PEOPLE_2D),
         **{topic: TOPICS_OF_NODE[topic] for topic in ('/tf', MARKERS, OVERLAY)},
@@ -219,7 +219,7 @@ class PeopleSession(TrackingSession):
         if self._scene is None:
             self._scene = Silhouettes(self._background_for(camera))
         if (pose := self.frames.pose) is not None:
-            # From another view the scene is another.
+            # The background depends on the pose of the camera.
             self._scene.see_from(CameraPose.of(pose.translation, pose.rotation), camera)
         found: list[Found] = []
         if detected is not None:
@@ -255,7 +255,7 @@ class PeopleSession(TrackingSession):
     def _matched(
         self, found: Sequence[Found], stamp: int
     ) -> tuple[dict[_Person, Found], list[Found]]:
-        """Detections of the people who are followed, by person, and the detections left over."""
+        """Return the detections by followed person, and the detections that match nobody."""
         named = {one.detected.name: one for one in found if one.detected.name}
         own = {x: named[x.known_as] for x in self.tracks if x.known_as in named}
         left = [one for one in found if one not in own.values()]
@@ -277,7 +277,7 @@ class PeopleSession(TrackingSession):
         background: BackgroundModel,
         stamp: int,
     ) -> None:
-        """Follows the largest of the detections left over; they move from `left` to `own`."""
+        """Starts tracks from the largest unmatched detections; moves them from `left` to `own`."""
         p, size = self.parameters, (camera.width, camera.height)
         for one in sorted(left, key=lambda x: -x.sighting.size):
             corners = np.clip(np.rint(one.sighting.corners), 0, size).astype(int)
@@ -303,7 +303,7 @@ class PeopleSession(TrackingSession):
             left.remove(one)
 
     def _new_name(self, given: str) -> str:
-        """Identity for topics: letters, digits and underscores, a letter first."""
+        """Return an unused identity for topics: letters, digits and underscores, a letter first."""
         taken = {track.person for track in self.tracks}
         name = re.sub(r'[^A-Za-z0-9_]', '_', given)
         if name:
@@ -321,7 +321,7 @@ class PeopleSession(TrackingSession):
         strangers: Sequence[Found],
         answered: bool,
     ) -> Iterator[tuple[Track, Seen]]:
-        """Everybody in an image, with the pixels that others cover."""
+        """Yields the tracks, nearest first, with the pixels that other people cover."""
         shape = waiting.image.shape[:2]
         areas = {
             person: person.expected_area(camera, own.get(person), waiting.stamp_ns)
@@ -366,7 +366,7 @@ class PeopleSession(TrackingSession):
         self._publish(PEOPLE, stamp, people_message(self._messages, people, stamp, frame))
 
     def _show_people(self, waiting: WaitingImage, camera: Camera) -> None:
-        """Markers and an overlay with everybody, for those who look at them."""
+        """Publishes markers and an overlay with all people, where they have subscribers."""
         if not (self._wanted(MARKERS) or self._wanted(OVERLAY)):
             return
         stamp, frame = waiting.stamp_ns, waiting.frame_id

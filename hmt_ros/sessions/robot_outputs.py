@@ -1,8 +1,8 @@
 """Outputs for robots: the pose of the person at a later time, and the space to keep out of.
 
-Both are made of the last image that showed the person. While no image does, because the track is
-lost, or no image comes, the space grows as fast as people move; only an image that says that nobody
-is in view frees it. Times are those of the stamps, so that the same images give the same bytes.
+Both are computed from the last image that showed the person. While the track is lost or no image
+arrives, the space grows as fast as people move; only an image that shows that nobody is in view
+frees it. Times are those of the stamps, so that the same images give the same bytes.
 """
 
 from __future__ import annotations
@@ -26,24 +26,25 @@ from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.keep_out import KeepOut, KeepOutState
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, TrackState
 
-# Time after the newest image that is predicted at most, s: a person may be anywhere by then.
+# Maximum time from the newest image to a forecast, s: later a person may be anywhere.
 LONGEST_FORECAST = 10.0
-# Forecasts that one image leads to at most: after a gap those between are of no use.
+# Maximum number of forecasts per image: after a gap the earliest are of no use.
 MOST_FORECASTS = 100
 
 
 @dataclass(frozen=True, eq=False)
 class LastSeen:
-    """A track in the last image that showed the person; nothing in it changes.
+    """A track at the last image that showed the person; it is immutable.
 
     Attributes:
-        stamp_ns, frame_id: of the image; the frame is that of the camera.
-        body: of the track.
-        posterior: over poses, in the frame of the camera.
-        forecaster: of the track.
-        fixed: frame that is published in; None: the frame of the camera.
-        probability: of the capsules.
-        focal_length_sigma: relative standard deviation of the focal length; `posterior` has it.
+        stamp_ns, frame_id: stamp of the image, ns, and frame of the camera.
+        body: body of the track.
+        posterior: posterior over poses, in the frame of the camera.
+        forecaster: forecaster of the track.
+        fixed: frame of the outputs; None: the frame of the camera.
+        probability: probability that the capsules contain the person.
+        focal_length_sigma: relative standard deviation of the focal length; `posterior` includes
+            it.
     """
 
     stamp_ns: int
@@ -57,7 +58,7 @@ class LastSeen:
 
     @cached_property
     def capsules(self) -> Capsules:
-        """Capsules that hold the person, in the frame that is published in."""
+        """Capsules that contain the person, in the frame of the outputs."""
         held = keep_out_capsules(self.body, self.posterior, self.probability)
         if self.fixed is None:
             return held
@@ -85,14 +86,14 @@ class _Told:
 class RobotOutputs:
     """Makes the outputs for robots.
 
-    `tell` and `forget` are for the thread that estimates, the others for any.
+    `keep_out` and `forecast` may be called by any thread, the others by the estimating thread.
     """
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Forgets the images, as time begins anew."""
+        """Forgets all images."""
         self._told, self._forecast_until = _Told(), 0
 
     def tell(
@@ -105,27 +106,27 @@ class RobotOutputs:
         seen: LastSeen | None = None,
         reason: str = '',
     ) -> None:
-        """Takes the result of an image.
+        """Sets the result of the newest image.
 
         Args:
-            stamp_ns, frame_id: of the image; the frame is the one that is published in.
+            stamp_ns, frame_id: stamp of the image, ns, and frame of the outputs.
             existence: probability that a person is in view; NaN: unknown.
-            seen: the track, in an image that shows the person; None: as in the image before.
-            reason: what is missing, see `KeepOut`.
+            seen: the track, if the image shows the person; None: the last one is kept.
+            reason: reason of the state, see `KeepOut`.
         """
         before = self._told.seen
         if state is KeepOutState.NOBODY:
             before = None
         elif state is KeepOutState.UNKNOWN and before is not None:
-            # A track was dropped; the person whom it followed may have moved on.
+            # A track was dropped; its person may have moved.
             state = KeepOutState.LOST
         self._told = _Told(state, stamp_ns, frame_id, track_id, existence, seen or before, reason)
 
     def keep_out(self, probability: float, silence: float | None = None) -> KeepOut:
-        """The space to keep out of.
+        """Return the space to keep out of.
 
         Args:
-            probability: that is requested; reported where there are no capsules.
+            probability: requested probability; reported if there are no capsules.
             silence: time since the newest image was answered, s; None: it is being answered.
         """
         told = self._told
@@ -154,10 +155,10 @@ class RobotOutputs:
         )
 
     def forecast(self, stamp_ns: int) -> PoseMixture:
-        """The pose at a time after the newest image.
+        """Return the forecast of the pose at a time after the newest image.
 
         Raises:
-            ValueError: there is no track, or the time is before the image or long after.
+            ValueError: nobody is tracked, or the time is before the image or long after.
         """
         told = self._told
         seen = told.seen
@@ -188,16 +189,16 @@ class RobotOutputs:
         )
 
     def due(self, rate: float, horizon: float) -> Iterable[int]:
-        """Times on a grid, ns, within the horizon of the newest image and of none before.
+        """Return the grid times, ns, within the horizon of the newest image but of none before.
 
         Args:
-            rate: times a second; 0: none.
+            rate: grid times per second; 0: none.
             horizon: maximum time from an image to a forecast, s.
         """
         told = self._told
         if rate <= 0.0 or told.seen is None:
             return ()
-        # Whole numbers: times since 1970 in ns are too large for products of floats.
+        # Exact fractions: times since 1970 in ns are too large for products of floats.
         every = SECOND_NS / Fraction(rate).limit_denominator(1000)
         until = told.stamp_ns + round(horizon * SECOND_NS)
         last = int(until // every)

@@ -1,4 +1,4 @@
-"""What the newest images show, kept for a smoother in the process of the filter."""
+"""Evidence of the newest images, kept for a smoother in the process of the filter."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 
 from hmt_ros.image.image_sequence import SeenImage
 
-# Memory that the images of a window take at most, MB; 47 images of a person who fills a picture of
-# 640 x 480 take 80.
+# Maximum memory of the images of a window, MB; 47 images of 640 x 480 pixels, which the person
+# fills, take 80 MB.
 MOST_MB = 256
 
 
@@ -20,10 +20,10 @@ class SeenImages:
     """Images by stamp; any thread may call the methods.
 
     Args:
-        most_mb: memory that they take at most, MB; the oldest go first.
+        most_mb: maximum memory of the images, MB; the oldest are dropped first.
 
     Attributes:
-        wanted: number of the newest that are kept.
+        wanted: maximum number of images; the newest are kept.
     """
 
     def __init__(self, most_mb: float = MOST_MB) -> None:
@@ -32,9 +32,9 @@ class SeenImages:
         self._lock = threading.Lock()
 
     def add(self, stamp_ns: int, image: SeenImage | None) -> None:
-        """Keeps the evidence of an image, None: it shows nobody.
+        """Keeps the evidence of an image; None if it shows nobody.
 
-        Those that are not older are of another time, and go.
+        Kept images that are not older belong to another time and are dropped.
         """
         if image is None:
             return
@@ -56,13 +56,13 @@ class SeenImages:
             self._kept = kept
 
     def of(self, stamps_ns: Sequence[int]) -> list[SeenImage | None]:
-        """The images of these stamps; None: it is not kept."""
+        """Return the images of some stamps; None for each that is not kept."""
         kept = self._kept
         return [kept[stamp][0] if stamp in kept else None for stamp in stamps_ns]
 
 
 def size_of(value: Any) -> int:
-    """Bytes of the arrays in a value."""
+    """Return the size of the arrays in a value, bytes."""
     if isinstance(value, np.ndarray):
         return int(value.nbytes)
     if is_dataclass(value):

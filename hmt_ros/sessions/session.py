@@ -1,10 +1,10 @@
-"""A session stands behind the topics of a node: messages in, messages out, without ROS.
+"""Base class of sessions, which hold the logic of a node: messages in, messages out, without ROS.
 
-The node and offline replay give their messages to one; the same messages in the same order give the
-same bytes. Messages that are estimated from are taken in the order of their stamps (`stamp_order`):
-one that is far ahead of those before, or older, waits until others agree with it. Where they agree
-on an older time the estimate starts anew. Messages that can not be used are skipped. The first
-fault of each kind is logged; all are counted.
+A node and an offline replay pass their messages to a session; the same messages in the same order
+give the same bytes. Messages that are estimated from are used in the order of their stamps
+(`stamp_order`): a message that is far ahead of the previous ones, or older, waits until others
+agree with it. If they agree on an older time, the estimate restarts. Messages that can not be used
+are skipped. The first fault of each kind is logged; all are counted.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from msg_tools import MessageError, RosbagsMessages
 from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.images import decode_image
 
-# Key of the diagnostics, before the name of a topic, for the number of its subscribers.
+# Prefix, before the name of a topic, of the diagnostics key for its number of subscribers.
 SUBSCRIBERS = 'subscribers of '
 FINISH = 'finish'  # source of the report of `finish`, at the end of the stream
 TIME_JUMP = 'time jumps back'  # kind of fault
-_MOST_STREAMS = 1000  # whose order is known
-_LATEST_NS = 2**31 * SECOND_NS  # first stamp that no message can hold
+_MOST_STREAMS = 1000  # maximum number of sources whose order is remembered
+_LATEST_NS = 2**31 * SECOND_NS  # first stamp beyond the range of a message, ns
 
 
 class PublishedTopic(NamedTuple):
-    """A topic of a node, the same in bags.
+    """A topic of a node; bags use the same name and type.
 
     Attributes:
         msgtype: for example 'hmt_msgs/msg/PoseMixture'.
-        latched: late subscribers get the last message.
+        latched: whether late subscribers get the last message.
     """
 
     msgtype: str
@@ -51,11 +51,11 @@ class PublishedTopic(NamedTuple):
 
 
 class NeededInput(NamedTuple):
-    """Messages without which a session does not go on.
+    """An input without which a session can not continue.
 
     Attributes:
-        sources: any of which is enough.
-        with_each: whether they have to come with every message that is estimated from.
+        sources: sources of the input; one of them is enough.
+        with_each: whether every message that is estimated from needs such an input.
     """
 
     sources: tuple[str, ...]
@@ -68,15 +68,15 @@ class SessionState(ABC):
 
     Attributes:
         status: in a word or two; see the sessions.
-        wants: input that the next step waits for, '' while it works.
-        entropy: of the weights of the present mixture, nats; NaN where there is none.
-        counts: number of the messages that are estimated from: 'received', and of these 'skipped',
+        wants: input that the next step waits for; '' while it works.
+        entropy: entropy of the weights of the present mixture, nats; NaN without a mixture.
+        counts: numbers of messages that are estimated from: 'received', and of these 'skipped',
             'dropped' and keys of the session.
         faults: number of faults by kind.
-        last_fault: the newest; '' before the first.
-        held_up: input that the last dropped message waited for; '' if only for its turn.
-        frame_id: of the newest message that is estimated from; '' before the first.
-        time_jump: what the last step back of the clock has led to; '' before the first.
+        last_fault: newest fault; '' before the first.
+        held_up: input that the last dropped message waited for; '' if it waited for its turn only.
+        frame_id: frame of the newest message that is estimated from; '' before the first.
+        time_jump: report on the last step back of the clock; '' before the first.
     """
 
     status: str
@@ -94,26 +94,26 @@ class SessionState(ABC):
         """The present estimate in a few words."""
 
     def trouble(self) -> str:
-        """Why the estimate is not to be trusted, '' where it is."""
+        """Return why the estimate can not be trusted; '' if it can."""
         return ''
 
     @abstractmethod
     def values(self) -> list[tuple[str, str]]:
-        """Keys and values that only this kind of session has in the diagnostics."""
+        """Return the keys and values of diagnostics that are specific to the kind of session."""
 
 
 def kind_of(source: str) -> str:
-    """Common name of similar sources: 'mixture' of 'mixture of /humans/bodies/p1'."""
+    """Return the common name of similar sources: 'mixture' for 'mixture of /humans/bodies/p1'."""
     return source.partition(' of ')[0]
 
 
 def everything(_topic: str) -> bool:
-    """Every topic is wanted."""
+    """Return True: every topic is wanted."""
     return True
 
 
 def never() -> bool:
-    """Nothing comes while an estimate is made."""
+    """Return False: no message arrives during an estimate."""
     return False
 
 
@@ -124,13 +124,13 @@ State = TypeVar('State', bound=SessionState)
 class Session(ABC, Generic[Parameters, State]):
     """Handles the messages of a node or a replay, one after the other.
 
-    All methods are to be called by one thread, unless they say otherwise; `state` and `parameters`
+    All methods must be called by one thread, unless they say otherwise; `state` and `parameters`
     may be read, and `parameters` replaced, by other threads.
 
     Args:
-        parameters: of the node.
+        parameters: parameters of the node.
         publish: takes each message to be published, as soon as it is made.
-        wanted: whether a topic needs to be published.
+        wanted: returns whether a topic needs to be published.
 
     Raises:
         ValueError: the parameters name something that can not be used.
@@ -139,16 +139,16 @@ class Session(ABC, Generic[Parameters, State]):
         TOPICS: the topics that are published.
         COUNTED: source of the messages that are estimated from, or the kind of several sources, see
             `kind_of`.
-        UNIT: name of one of them.
-        DONE: name of those that were used; a key of `SessionState.counts`.
-        ESTIMATE: name of the estimate that starts anew when time jumps back.
-        CHECKED: parameters whose values only a new session can check: names of files, say.
-        parameters: a new value takes effect as `declared_parameters` says.
-        interrupted: whether messages have come during an estimate; a node sets it.
-        state: replaced with every message.
+        UNIT: name of such a message.
+        DONE: key of `SessionState.counts` for the messages that were used.
+        ESTIMATE: name of the estimate that restarts when time jumps back.
+        CHECKED: parameters whose values only a new session can check, for example names of files.
+        parameters: parameters; a new value takes effect as `declared_parameters` says.
+        interrupted: returns whether messages have arrived during an estimate; a node sets it.
+        state: present state; replaced with every message.
         topic_names: full names of the topics by source, for faults; empty without topics.
-        decode_image: the picture of a message; a node shares it with others of its process.
-        publishing: time that messages took to be made into bytes and published, s; for diagnostics.
+        decode_image: decodes the image of a message; a node shares it with others of its process.
+        publishing: time spent on serialising and publishing messages, s; for diagnostics.
     """
 
     TOPICS: ClassVar[Mapping[str, PublishedTopic]]
@@ -174,7 +174,7 @@ class Session(ABC, Generic[Parameters, State]):
         self._log = HandlingLog()
         self._frame_id = ''
         self._time_jump = ''
-        # Of the messages that are estimated from, by source.
+        # Order of the messages that are estimated from, by source.
         self._orders: dict[str, StampOrder] = {}
         self.topic_names: Mapping[str, str] = {}
         self.decode_image: Callable[[Any], Image] = decode_image
@@ -182,14 +182,14 @@ class Session(ABC, Generic[Parameters, State]):
         self._set_up()
 
     def _set_up(self) -> None:
-        """Makes the state of a kind of session; raises ValueError as the class does."""
+        """Creates the attributes of a kind of session; raises ValueError as the class does."""
 
     def share(self, images: SeenImages) -> None:
-        """Takes the store of images of its process, before the first message."""
+        """Sets the image store of the process; is called before the first message."""
 
     @property
     def most_waiting(self) -> int:
-        """Maximum number of messages to be estimated from that wait for an estimate."""
+        """Maximum number of messages that wait for an estimate."""
         return self.parameters.queue_size
 
     def take(self, source: str, message: Any, *, more: bool = False) -> Handled:
@@ -198,7 +198,7 @@ class Session(ABC, Generic[Parameters, State]):
         Args:
             source: a source that the module of the session names.
             message: of the type of the source, from `rosbags` or ROS.
-            more: whether another message has come already; work that can wait is left until then.
+            more: whether another message waits already; work that can wait is left for it.
         """
         try:
             stamp = self._stamp_of(source, message)
@@ -227,18 +227,18 @@ class Session(ABC, Generic[Parameters, State]):
         self.state = self._present_state()
 
     def finish(self) -> Handled:
-        """Uses messages that wait for others which do not come any more."""
+        """Uses the waiting messages, as no others will arrive."""
         self._log.begin()
         for source, order in self._orders.items():
             self._use(source, order.end())
         return self._handled(FINISH, self._end())
 
     def _end(self) -> int:
-        """Uses the messages that wait; returns the stamp of the newest message, ns, or 0."""
+        """Uses the waiting messages; returns the stamp of the newest message, ns, or 0."""
         return 0
 
     def refuse(self, source: str, text: str, stamp: int = 0, *, more: bool = False) -> Handled:
-        """Counts a message that could not be read; `more` as for `take`."""
+        """Counts a message that can not be read; for `more` see `take`."""
         self._log.begin()
         self._log.fault('message', f'message of {source} can not be read: {text}')
         if not more:
@@ -246,7 +246,7 @@ class Session(ABC, Generic[Parameters, State]):
         return self._handled(source, stamp)
 
     def drop(self, stamp_ns: int) -> Handled:
-        """Reports a message to be estimated from that was dropped before it came here."""
+        """Reports a message that was dropped before it reached the session."""
         self._log.begin()
         self._log.counts['received'] += 1
         self._drop(stamp_ns)
@@ -260,33 +260,33 @@ class Session(ABC, Generic[Parameters, State]):
         return replace(self._log.handled(source, 0), warnings=())
 
     def count_dropped(self, messages: int) -> None:
-        """Counts messages that were dropped before they came here, because the node was late."""
+        """Counts messages that a late node dropped before they reached the session."""
         if messages:
             self._log.count_dropped(messages)
             self.state = self._present_state()
 
     @abstractmethod
     def _take(self, source: str, message: Any, stamp: int) -> None:
-        """Handles a message; `take` reports on it."""
+        """Handles a message; `take` returns the report."""
 
     def _use_what_has_come(self) -> None:
-        """Estimates from the messages that `_take` has put aside."""
+        """Estimates from the messages that `_take` has stored."""
 
     def _drop(self, stamp_ns: int) -> None:
-        """Drops a message to be estimated from, because the session is late."""
+        """Reports a message that is dropped because the session is late."""
         text = f'{self.UNIT} of {stamp_ns} ns is dropped: newer ones came before its turn'
         self._log.drop(text)
 
     @abstractmethod
     def _present_state(self) -> State:
-        """The state now."""
+        """Return the present state."""
 
     def _is_counted(self, source: str) -> bool:
         """Whether the messages of a source are estimated from."""
         return kind_of(source) == self.COUNTED
 
     def _stamp_of(self, source: str, message: Any) -> int:
-        """Stamp of a message, ns."""
+        """Return the stamp of a message, ns."""
         return time_ns(message.header.stamp)
 
     def _handled(self, source: str, stamp: int) -> Handled:
@@ -294,7 +294,7 @@ class Session(ABC, Generic[Parameters, State]):
         return self._log.handled(source, stamp)
 
     def _totals(self, weights: NDArray[np.float64] | None = None) -> dict[str, Any]:
-        """Fields of `SessionState` over all messages, and of the weights of a mixture."""
+        """Return the counts of all messages and the entropy of weights, for `SessionState`."""
         log = self._log
         return {
             'entropy': math.nan if weights is None else entropy(weights),
@@ -307,12 +307,12 @@ class Session(ABC, Generic[Parameters, State]):
         }
 
     def _on_topic(self, source: str) -> str:
-        """Names a source and its topic, for faults."""
+        """Return the name of a source with its topic, for faults."""
         topic = self.topic_names.get(source)
         return f'{source} on {topic}' if topic else source
 
     def _turn_of(self, source: str, one: Stamped) -> Turn:
-        """What follows from the next message of a source; where time jumps back, a new start."""
+        """Put a message in order; return the messages to use; restart if time jumps back."""
         order = self._orders.setdefault(source, StampOrder())
         if len(self._orders) > _MOST_STREAMS:
             del self._orders[next(iter(self._orders))]
@@ -320,16 +320,16 @@ class Session(ABC, Generic[Parameters, State]):
         turn = order.put(one, expected=self.parameters.reset_on_time_jump)
         text = f'{self.UNIT} of {one.stamp} ns comes after one of {newest} ns'
         if turn.back:
-            # Of other streams, too.
+            # The order of other sources is forgotten, too.
             self._orders = {source: order}
             self._time_jump = (
                 f'the clock went back by {turn.back / SECOND_NS:.3g} s: {text}, and '
-                f'{len(turn.use)} agree; {self.ESTIMATE} starts anew'
+                f'{len(turn.use)} agree; {self.ESTIMATE} starts again'
             )
             self._log.note(TIME_JUMP, self._time_jump, warn=True)
             self._jump_back(turn.use[0].stamp, turn.use[-1].stamp)
         elif turn.late and newest is not None and one.stamp < newest:
-            hint = f'with reset_on_time_jump {self.ESTIMATE} would start anew'
+            hint = f'with reset_on_time_jump {self.ESTIMATE} would start again'
             self._log.skip(TIME_JUMP, f'{text}: skipped; {hint}')
         elif turn.late:
             self._log.skip('time stands still', f'{text}, wanted stamps that increase')
@@ -340,7 +340,7 @@ class Session(ABC, Generic[Parameters, State]):
         for stray, _ in turn.stray:
             text = f'{self.UNIT} of {stray} ns is left out: its stamp is far from those of others'
             self._log.counts['skipped'] += 1
-            # Not a fault of the message that shows it.
+            # No fault of the message that is handled now.
             self._log.note('stray stamp', text)
         for one in turn.use:
             skipped = self._log.counts['skipped']
@@ -349,10 +349,11 @@ class Session(ABC, Generic[Parameters, State]):
                 self._orders[source].newest = one.stamp
 
     def _jump_back(self, first: int, last: int) -> None:
-        """Starts the estimate anew, as time begins again.
+        """Restarts the estimate after time has jumped back.
 
         Args:
-            first, last: stamps of the messages that say so, which are used next, ns.
+            first, last: first and last stamp of the messages after the jump, which are used next,
+                ns.
         """
         self.restart()
 
@@ -364,12 +365,12 @@ class Session(ABC, Generic[Parameters, State]):
 
 
 def frame_id_of(message: Any) -> str:
-    """The frame that a message names; '' where it names none."""
+    """Return the frame that a message names; '' if it names none."""
     header = getattr(message, 'header', None)
     return '' if header is None else str(header.frame_id)
 
 
 def entropy(weights: NDArray[np.float64]) -> float:
-    """Entropy of the weights of a mixture, nats; NaN where there are none."""
+    """Return the entropy of the weights of a mixture, nats; NaN without weights."""
     some = weights[weights > 0.0]
     return float(-(some * elementary.log(some)).sum()) if len(weights) else math.nan

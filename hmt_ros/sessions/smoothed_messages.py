@@ -1,4 +1,4 @@
-"""Messages about a smoothed window, as `track_messages` makes them about a tracked image."""
+"""Messages about a smoothed window; `track_messages` has those about a tracked image."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ TOPICS = {
     '/tf': PublishedTopic('tf2_msgs/msg/TFMessage'),
 }
 TRACED = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')
-# The heaviest trajectories that are drawn.
+# Maximum number of trajectories that are drawn, the heaviest.
 DRAWN = 8
 
 
@@ -44,8 +44,8 @@ class SmoothedBody:
     """The person of the poses.
 
     Attributes:
-        body: at its present lengths.
-        frame_id: that the poses are in.
+        body: body with its present lengths.
+        frame_id: frame of the poses.
         track_id: number of the track of the filter; 0: unknown.
     """
 
@@ -55,11 +55,11 @@ class SmoothedBody:
 
 
 class OpenPose(NamedTuple):
-    """Content of a message on an image besides its poses.
+    """Fields of a mixture of the filter that are published with its smoothed pose.
 
     Attributes:
-        state: of the track in the filter.
-        existence: probability that a person is in view, in the filter; NaN: unknown.
+        state: state of the track in the filter.
+        existence: probability that a person is in view, by the filter; NaN: unknown.
         shape: (d, d) covariance of the errors shared by poses of all images; None: unknown.
     """
 
@@ -71,12 +71,13 @@ class OpenPose(NamedTuple):
 def trajectory_content(
     found: TrajectoryMixture, of: SmoothedBody, *, covariances: bool, shapes: Mapping[int, Array]
 ) -> TrajectoryContent:
-    """The content of a message on a mixture over trajectories.
+    """Return the content of a message on a mixture over trajectories.
 
     Args:
         found: trajectories, with stamps.
-        covariances: whether they are part of the message.
-        shapes: (d, d) by stamp, added to covariances: of errors shared by poses of all images.
+        covariances: whether the message has covariances.
+        shapes: covariances (d, d), by stamp, of errors shared by poses of all images; they are
+            added to the covariances of the poses.
     """
     content = found.message_content(covariances=covariances)
     if covariances:
@@ -111,7 +112,7 @@ def window_messages(
     covariances: bool,
     shapes: Mapping[int, Array],
 ) -> Iterator[tuple[str, Any]]:
-    """Topics and messages of a window; arguments as of `trajectory_content`."""
+    """Yields topics and messages of a window; for arguments see `trajectory_content`."""
     if wanted('trajectory_mixture'):
         content = trajectory_content(found, of, covariances=covariances, shapes=shapes)
         yield 'trajectory_mixture', trajectory_mixture_message(MESSAGES, content)
@@ -130,13 +131,13 @@ def final_messages(
     *,
     frame_prefix: str | None,
 ) -> Iterator[tuple[str, Any]]:
-    """Topics and messages of a pose that will not be revised.
+    """Yields topics and messages of a pose that will not be revised.
 
     Args:
-        frame_prefix: of the names of the links on /tf; None: there are no transforms.
+        frame_prefix: prefix of the names of the links on /tf; None: no transforms.
 
     Raises:
-        MessageError: a mixture that a message must not have.
+        MessageError: the mixture is invalid in a message.
     """
     shows_links = frame_prefix is not None and wanted('/tf')
     if not (wanted('smoothed_pose_mixture') or wanted('smoothed_joint_states') or shows_links):
@@ -167,7 +168,7 @@ def final_messages(
 
 
 def with_shape(mixture: GaussianMixture, shape: Array | None) -> GaussianMixture:
-    """A mixture over poses with the covariance (d, d) of errors shared by all images; None: 0."""
+    """Add the covariance (d, d) of errors shared by all images to a mixture; None adds nothing."""
     if shape is None:
         return mixture
     return replace(mixture, covariances=mixture.covariances + shape)
@@ -176,10 +177,10 @@ def with_shape(mixture: GaussianMixture, shape: Array | None) -> GaussianMixture
 def nobody_messages(
     of: SmoothedBody, stamp_ns: int, existence: float, wanted: Callable[[str], bool]
 ) -> Iterator[tuple[str, Any]]:
-    """Topics and messages at a time after which nobody is in view.
+    """Yields topics and messages at a time from which nobody is in view.
 
     Args:
-        of: person of the poses before.
+        of: person of the previous poses.
         existence: probability that a person is in view; NaN: unknown.
     """
     if wanted('trajectory_markers'):
@@ -200,7 +201,7 @@ def nobody_messages(
 
 
 def _markers(of: SmoothedBody, joints: Array, weights: Array, stamp_ns: int) -> Any:
-    """visualization_msgs/MarkerArray of joint positions (M, T, J, 3); it removes other ranks."""
+    """Return a MarkerArray of joint positions (M, T, J, 3); it removes markers of other ranks."""
     names = of.body.joint_names
     edges = [(names[a], names[b]) for a, b in of.body.skeleton.bones]
     return trajectory_markers(
@@ -209,11 +210,11 @@ def _markers(of: SmoothedBody, joints: Array, weights: Array, stamp_ns: int) -> 
 
 
 def _joints(means: Array, body: Body) -> Array:
-    """Joint positions (M, T, J, 3) of trajectories (M, T, d)."""
+    """Return the joint positions (M, T, J, 3) of trajectories (M, T, d)."""
     joints = body.joint_positions(means.reshape(-1, body.dimension))
     return joints.reshape(*means.shape[:2], len(body.joint_names), 3)
 
 
 def _symmetric(covariances: Array) -> Array:
-    """The covariances without the asymmetry of rounding."""
+    """Remove the asymmetry of covariances that is due to rounding."""
     return 0.5 * (covariances + np.swapaxes(covariances, -1, -2))

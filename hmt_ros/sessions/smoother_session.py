@@ -1,30 +1,29 @@
-"""The smoother behind its topics.
+"""Session of the smoother: likelihood mixtures in, smoothed poses and trajectories out.
 
 The rules, besides those of `Session`:
 
-- Mixtures are smoothed in the order of their stamps, in a sliding window, ten times a second at
-  most: neighbours hardly differ. A pose is published as smoothed before it is older than the
-  newest by more than `fixed_lag` and a fifth of it; those that are still open when the window ends
-  are published then: at the end of the stream (`finish`), where time jumps
-  back, at a new body.
-- A mixture names its body and carries the segment lengths of the person; without lengths it is
-  about the model at its own lengths. Another body, lengths that jump, another frame or another
-  track_id are a new track, and start a new window; lengths that change slowly are estimated better
-  and better.
-- A likelihood without components says that nobody is in view any more: the window ends, and a
-  smoothed mixture without components and markers that remove those before go out.
-- The chain of the filter's modes, which likelihoods carry (`posterior_weight`, `ancestry`), is the
-  only judge of motions. Where a publisher does not tell it, a mode continues all within reach.
-- Errors of images last, by the error model that a likelihood carries and the time since the image
-  before (`error_model`). A likelihood without an error model, and a forecast, which is no
-  evidence, are skipped.
+- Mixtures are smoothed in the order of their stamps, in a sliding window, at most every 0.1 s, or
+  every fifth of `fixed_lag` if that is shorter: neighbouring results hardly differ. A smoothed pose
+  is published before it is older than the newest by more than 1.2 times `fixed_lag`. Poses that are
+  still open when the window ends are published then: at the end of the stream (`finish`), when
+  time jumps back, and at a new body.
+- A mixture names its body and carries the segment lengths of the person; without them the lengths
+  of the model apply. Another body, a jump of the lengths, another frame or another track_id means
+  a new track and starts a new window. Slow changes of the lengths refine their estimate.
+- A likelihood without components means that nobody is in view: the window ends, and a smoothed
+  mixture without components is published, with markers that remove the earlier ones.
+- The chain of the filter's modes, which likelihoods carry (`posterior_weight`, `ancestry`), alone
+  determines the weights of motions. Without it, a mode may continue every mode within reach.
+- Errors of consecutive images are correlated, by the error model that a likelihood carries and the
+  time between the images (`error_model`). A likelihood without an error model is skipped; so is a
+  forecast, which is no evidence.
 - The uncertainty of the person's shape is the same in all images. It is added once, to the
   covariances that are published.
-- Near the limits of the root's angles, as of a person before a camera on its side, mixtures are
-  smoothed as a camera sees them that is turned by quarter turns; then a new window begins.
-- Angles that go round are taken from mixture to mixture without whole turns, each mode from the
-  nearest one before: to the dynamics a turn more would be a jump.
-- The dynamics bridge gaps. One that is longer than `LONGEST_INTERVAL` is reported.
+- Near the limits of the root's angles, for example with a camera on its side, mixtures are smoothed
+  in the frame of a camera that is rotated by quarter turns; a new window begins then.
+- Cyclic angles are unwrapped from mixture to mixture, each mode relative to the nearest previous
+  mode: to the dynamics a whole turn would be a jump.
+- The dynamics bridge gaps. Gaps longer than `LONGEST_INTERVAL` are reported.
 """
 
 from __future__ import annotations
@@ -72,14 +71,14 @@ from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 
 MIXTURE, TRAJECTORIES = 'likelihood_mixture', 'trajectory_mixture'
 NOBODY = 'nobody'  # status while nobody is in view
-# Change of a length from one mixture to the next above which it is another person's, m.
+# Maximum change of a segment length between two mixtures of the same person, m.
 SAME_PERSON = 0.02
-# Time between two smoothings, as a share of the lag, and at most, s: neighbours hardly differ.
+# Minimum time between two smoothings: as a fraction of the lag, but not more than RARELY, s.
 SHARE_OF_LAG, RARELY = 0.2, 0.1
-# Interval between two mixtures above which a gap is reported, s.
+# Maximum interval between two mixtures that is not reported as a gap, s.
 LONGEST_INTERVAL = 0.25
-# Factor on the variance that the motion prior of the filter gains in a second. Sudden motion is
-# more frequent than under a Gaussian of the mean variance; chosen on clips (docs/smoothing.md).
+# Factor on the diffusion of the filter's motion prior. Sudden motion is more frequent than under
+# a Gaussian of the mean variance; chosen on clips (docs/smoothing.md).
 LIVELINESS = 2.0
 
 
@@ -88,10 +87,10 @@ class SmootherState(SessionState):
     """State of the smoother: its status is 'waiting', 'smoothing' or 'nobody'.
 
     Attributes:
-        window: poses in the window.
-        trajectories: components of the mixture over them.
-        gaps: intervals between mixtures that were longer than `LONGEST_INTERVAL`.
-        longest_gap: s.
+        window: number of poses in the window.
+        trajectories: number of components of the mixture over trajectories.
+        gaps: number of intervals between mixtures that were longer than `LONGEST_INTERVAL`.
+        longest_gap: longest of these intervals, s.
     """
 
     window: int = 0
@@ -104,7 +103,7 @@ class SmootherState(SessionState):
         return f'{self.trajectories} trajectories of {self.window} poses'
 
     def trouble(self) -> str:
-        """Whether nobody is in view."""
+        """Return 'nobody in view' if so, else ''."""
         return 'nobody in view' if self.status == NOBODY else ''
 
     def values(self) -> list[tuple[str, str]]:
@@ -119,7 +118,7 @@ class SmootherState(SessionState):
 
 
 def untold(text: str) -> None:
-    """Drops what a caller does not want to be told."""
+    """Ignores a report."""
 
 
 class SmootherSession(Session[SmootherParameters, SmootherState]):
@@ -128,7 +127,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     `smooth_span` may be called by any thread.
 
     Attributes:
-        kept: for `smooth_span`.
+        kept: newest likelihoods of the window, for `smooth_span`.
     """
 
     TOPICS = TOPICS
@@ -173,7 +172,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         """See `Session`."""
         self._window: SlidingWindow | None = None
         self._weights = np.empty(0)
-        # By stamp, of the poses of the window that have not been published.
+        # Poses of the window that have not been published, by stamp.
         self._open: dict[int, OpenPose] = {}
         self._newest: int | None = None
         self._nobody = False
@@ -254,7 +253,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             self._publish_final(pose, of)
 
     def _chained(self, evidence: Evidence, content: PoseMixture, body: Body) -> Evidence:
-        """The evidence with angles and modes that go on from those of the mixture before."""
+        """Return the evidence with unwrapped angles and modes linked to the previous mixture."""
         mixture, kept = evidence.modes.mixture, self.kept.items
         heaviest = mixture.means[[int(np.argmax(mixture.weights))]]
         before = kept[-1].modes.mixture.means if kept else heaviest
@@ -276,10 +275,10 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 self._publish(topic, stamp, made)
 
     def _whose(self, content: PoseMixture) -> SmoothedBody:
-        """The person that a mixture is about; the same object while that does not change.
+        """Return the person of a mixture: the same object while the person does not change.
 
         Raises:
-            MessageError: a body that is not known, or not the one that the parameters name.
+            MessageError: the body is unknown, or not the one that the parameters name.
         """
         about = (
             content.body_model,
@@ -292,7 +291,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             return self._resolved[1]
         chosen = self.parameters.body_model
         try:
-            # A message must not cause files to be read: its body has to ship with the package.
+            # A message must not cause files to be read: its body must ship with the package.
             model = _chosen_body(chosen) if chosen else named_body(content.body_model)
         except (OSError, ValueError) as error:
             raise MessageError(public_line(error), 'body') from error
@@ -302,7 +301,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         return of
 
     def _clear(self, of: SmoothedBody, mixture: GaussianMixture) -> SmoothedBody:
-        """The person, with a level at which the heaviest pose is far from the poles."""
+        """Return the person with a level that keeps the heaviest pose far from the poles."""
         heaviest = mixture[np.array([np.argmax(mixture.weights)])]
         seen = relevelled(of.body.levelled(np.eye(3)), heaviest, of.body)
         level = clear_level(of.body, seen.means[0])
@@ -314,7 +313,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         return of
 
     def _begin_track(self, of: SmoothedBody) -> None:
-        """Ends the window of another person."""
+        """Sets the person; ends the window if it is another person's."""
         known = self._of
         if known is not None and _same(known, of):
             self._of = of
@@ -327,7 +326,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self.kept = KeptMixtures(of, ())
 
     def _smoother(self, body: Body) -> MotionSmoother:
-        """The smoother that the parameters ask for."""
+        """Return a smoother with the settings of the parameters."""
         p = self.parameters
         prior = motion_prior(body)
         return MotionSmoother(
@@ -342,7 +341,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     def _end_window(self) -> None:
         """Publishes the poses that are still open, and forgets the window."""
         if self._window is not None and self._of is not None:
-            # A track may go on in another window.
+            # A track may continue in another window.
             self._first_identity = self._window.next_identity
             for pose in self._window.finish():
                 self._publish_final(pose, self._of)
@@ -369,14 +368,14 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         May be called by any thread, at any time.
 
         Args:
-            from_ns, to_ns: first and last stamp, inclusive; 0: the oldest, the newest.
-            tell: called with whether images have refined the motions, and if not, why.
+            from_ns, to_ns: first and last stamp, inclusive; 0: the oldest and the newest.
+            tell: called with a line that says whether images refined the motions or why not.
 
         Returns:
             hmt_msgs/TrajectoryMixture with covariances.
 
         Raises:
-            ValueError: there is none in the span, or they can not be smoothed.
+            ValueError: the span has no mixtures, or they can not be smoothed.
         """
         found, of = self.smoothed_span(from_ns, to_ns, tell)
         shapes = _shapes((one.modes.stamp_ns, one.shape) for one in self.kept.items)
@@ -386,7 +385,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     def smoothed_span(
         self, from_ns: int = 0, to_ns: int = 0, tell: Callable[[str], None] = untold
     ) -> tuple[TrajectoryMixture, SmoothedBody]:
-        """The trajectories of a span of time, and their person; see `smooth_span`."""
+        """Return the trajectories of a span of time, and their person; see `smooth_span`."""
         of, items = self.kept
         chosen = [
             item.modes
@@ -436,13 +435,13 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
 
 
 def _chosen_body(model: str) -> Body:
-    """The body that the parameters name."""
+    """Return the body that the parameters name."""
     with named_file('body_model', model, 'body model'):
         return load_body(model)
 
 
 def _levelled(evidence: Evidence, body: Body) -> Evidence:
-    """Evidence over poses with root angles against the camera, as one over poses of a body."""
+    """Convert evidence with root angles relative to the camera to the level of a body."""
     camera = body.levelled(np.eye(3))
     if camera is body:
         return evidence
@@ -455,12 +454,12 @@ def _levelled(evidence: Evidence, body: Body) -> Evidence:
 
 
 def _shapes(items: Iterable[tuple[int, Array | None]]) -> dict[int, Array]:
-    """The covariances of shapes that are known, by stamp."""
+    """Return the known covariances of shapes, by stamp."""
     return {stamp: shape for stamp, shape in items if shape is not None}
 
 
 def _same(one: SmoothedBody, other: SmoothedBody) -> bool:
-    """Whether two bodies are one person, whose lengths are estimated from image to image."""
+    """Whether two bodies belong to one person, whose length estimates may change slowly."""
     same_track = 0 in (one.track_id, other.track_id) or one.track_id == other.track_id
     return (
         same_track

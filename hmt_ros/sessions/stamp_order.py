@@ -1,8 +1,8 @@
 """The order of the messages of a stream, by their stamps; one stray stamp changes nothing.
 
-A message that is not in order, as it is older than the one before or far ahead of it, is put aside.
-Once several messages in a row agree that it is a later or an earlier time they are all used: the
-source has paused, or its clock was set. Those that no other one confirms are stray.
+A message that is older than the previous one, or far ahead of it, is put aside. Once several
+messages in a row agree on the later or earlier time, all of them are used: the source has paused,
+or its clock was set. Messages that no other message confirms are stray.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 from msg_tools.messages.headers import SECOND_NS
 
-# Messages in a row that make another time true, and least step back that may be one of the clock,
-# ns: a shorter one is soon caught up with. The same where such steps are expected.
+# Number of messages in a row that confirm another time, and minimum step back of a clock, ns: the
+# stream soon makes up for a shorter step. EXPECTED applies if the clock may go back.
 AGREEING, EXPECTED = (3, SECOND_NS), (2, 0)
-# Least step ahead that others must confirm, ns, and in intervals of the stream.
+# Minimum step ahead that other messages must confirm, ns, and in intervals of the stream.
 _AHEAD_NS, _INTERVALS = SECOND_NS, 5
 
 
@@ -31,7 +31,7 @@ class Turn(NamedTuple):
     Attributes:
         use: messages to use now, in their order.
         stray: messages that were put aside and are not used.
-        late: whether the message itself is left out, as it is not younger than the one before.
+        late: whether the new message is skipped, as it is not newer than earlier ones.
         back: time by which the clock went back before the first of `use`, ns.
     """
 
@@ -45,8 +45,8 @@ class StampOrder:
     """The order of one stream.
 
     Attributes:
-        newest: stamp of the newest message that could be used, ns, which whoever uses them sets;
-            None before the first.
+        newest: stamp of the newest message that could be used, ns, set by the caller that uses
+            them; None before the first.
     """
 
     def __init__(self) -> None:
@@ -55,10 +55,10 @@ class StampOrder:
         self._aside: tuple[Stamped, ...] = ()
 
     def put(self, one: Stamped, *, expected: bool) -> Turn:
-        """Takes the next message.
+        """Puts the next message in order.
 
         Args:
-            expected: whether the clock of the messages may go back, as where a bag is played again.
+            expected: whether the clock may go back, for example when a bag is played again.
         """
         newest, aside = self.newest, self._aside
         agreeing, least_back = EXPECTED if expected else AGREEING
@@ -78,14 +78,14 @@ class StampOrder:
         return self._used(use, back=max(newest - use[0].stamp, 0))
 
     def end(self) -> Turn:
-        """The messages that no other one follows any more: those ahead are used."""
+        """Return the turn at the end of the stream: messages ahead are used, others are stray."""
         aside, self._aside = self._aside, ()
         if aside and self.newest is not None and aside[0].stamp > self.newest:
             return self._used(aside)
         return Turn(stray=aside)
 
     def _longest(self) -> float:
-        """Longest interval to the next message that is no jump, ns."""
+        """Return the maximum interval to the next message that is not a jump, ns."""
         interval = self._interval
         return float('inf') if interval is None else max(_AHEAD_NS, _INTERVALS * interval)
 

@@ -1,9 +1,9 @@
 """The track of one person before a camera: images in, mixtures over poses out.
 
-Of several people each has topics in `humans/bodies/<id>/` (REP 155), and frames of links that begin
-with `body_<id>/`; a person without a name has neither. When the person is no longer in view one
-mixture without components of either kind goes out, with markers that remove those before, and then
-nothing until a new track starts. Outputs for robots go out for every image, whatever it shows.
+If several people are tracked, each has topics in `humans/bodies/<id>/` (REP 155), and link frames
+that begin with `body_<id>/`; a person without a name has neither. When the person is no longer in
+view, one mixture of each kind without components is published, with markers that remove the earlier
+ones, and then nothing until a new track starts. Outputs for robots are published for every image.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from msg_tools.files.error_line import error_line
 from msg_tools.messages.keep_out import KeepOutState
 
 BODIES = 'humans/bodies'
-# Change of a length above which a body is described anew, m.
+# Maximum change of a segment length without a new body message, m.
 RESHAPED = 0.005
 _STATES = {
     Status.WAITING: KeepOutState.UNKNOWN,
@@ -55,29 +55,29 @@ _STATES = {
 
 
 def topic_of(person: str, topic: str) -> str:
-    """Name of a topic of a person; all people share absolute ones, and nobody has no name."""
+    """Return a person's topic; absolute topics are shared, and a person '' has no namespace."""
     return f'{BODIES}/{person}/{topic}' if person and not topic.startswith('/') else topic
 
 
 def person_of(topic: str) -> str:
-    """The person whose topic this is; '' for a shared topic."""
+    """Return the person that a topic belongs to; '' for a shared topic."""
     name = topic.removeprefix(f'{BODIES}/')
     return '' if name == topic else name.partition('/')[0]
 
 
 @dataclass(eq=False)
 class Shared:
-    """What the tracks of a session share.
+    """Objects that the tracks of a session share.
 
     Attributes:
-        frames: that transforms lead to from the camera.
-        log: of the session.
+        frames: frames related to the camera by transforms.
+        log: log of the session.
         publish: takes topic, stamp and message.
-        wanted: whether a topic needs to be published.
-        answering: held while outputs for robots are made: those of the watchdog never follow the
-            answer to a newer image.
-        answered: number of answers to images that went to robots.
-        seen_images: of the only person, in the frame of the camera, for a smoother.
+        wanted: returns whether a topic needs to be published.
+        answering: lock on the outputs for robots, so that an output of the watchdog never follows
+            the answer to a newer image.
+        answered: number of images that were answered for robots.
+        seen_images: evidence on the only person, in the frame of the camera, for a smoother.
     """
 
     frames: CameraFrames
@@ -90,11 +90,11 @@ class Shared:
 
 
 class Seen(NamedTuple):
-    """What is seen of a person in an image, besides the image itself; see `Tracker.step`.
+    """Evidence on a person in an image, besides the image itself; see `Tracker.step`.
 
     Attributes:
-        keypoints: of this person, those that were seen; None: the detector has not answered.
-        prediction: of the pose, or that nobody is there; None: there is none.
+        keypoints: keypoints of the person that were seen; None: the detector has not answered.
+        prediction: prediction of the pose, or `Status.NOBODY`; None without a prediction.
         others: (H, W) pixels that other people cover; None: none.
     """
 
@@ -104,19 +104,19 @@ class Seen(NamedTuple):
 
 
 class Track:
-    """Tracks one person; all but `stale` is for the thread that estimates.
+    """Tracks one person; only `stale` may be called by other threads than the estimating one.
 
     Args:
-        person: identity, which is part of topics and frames; '': the only one.
-        parameters: of the node, until the next image brings others.
-        background: of several people, which is learned elsewhere; None: an own one.
+        person: identity, which is part of topics and frames; '': the only person.
+        parameters: parameters of the node; each image may replace them.
+        background: background that several people share, learned elsewhere; None: its own.
 
     Attributes:
         person: identity.
-        start: of the track.
-        tracker: None: nothing was tracked since the start.
-        body: that was described last; None: there is no track.
-        weights: of the present mixture; empty: there is none.
+        start: start of the track.
+        tracker: the tracker; None before the first image after a restart.
+        body: body that was published last; None before the first after a restart.
+        weights: weights of the present mixture; empty if there is none.
         robot: outputs for robots; may be read by any thread.
     """
 
@@ -136,11 +136,11 @@ class Track:
         self._described: tuple[str, str] | None = None
         self.restart(start)
         for topic in TOPICS_OF_NODE if person else ():
-            # The publisher opens them now, not at the first message, which would be lost.
+            # Creates the publishers now: a message right after their creation would be lost.
             self._wants(topic)
 
     def restart(self, start: TrackStart) -> None:
-        """Drops the track; the next images start another one."""
+        """Drops the track; a new one starts with the images that follow."""
         self._last_id, self.start = self.track_id, start
         self.tracker = None
         self.body: Body | None = None
@@ -150,12 +150,12 @@ class Track:
 
     @property
     def track_id(self) -> int:
-        """Number of the present track, or of the last one; 0 before the first."""
+        """Number of the present or last track; 0 before the first."""
         return self._last_id if self.tracker is None else self.tracker.track_id
 
     @property
     def status(self) -> Status:
-        """Of the tracker."""
+        """Status of the tracker."""
         return Status.WAITING if self.tracker is None else self.tracker.estimate.status
 
     @property
@@ -166,10 +166,10 @@ class Track:
     def follow(
         self, waiting: WaitingImage, camera: Camera, seen: Seen, parameters: FilterParameters
     ) -> bool | None:
-        """Takes an image, and publishes the results.
+        """Tracks the person in an image, and publishes the results.
 
         Returns:
-            Whether they were published, or the image could not be used; None: there is no track.
+            True if mixtures were published, False if that was impossible; None without a track.
         """
         self._parameters = parameters
         log, stamp, answered = self._shared.log, waiting.stamp_ns, False
@@ -205,7 +205,7 @@ class Track:
             elif len(self.weights):
                 self._publish_nobody(tracker, waiting)
             if not starts and tracker.estimate.status is Status.WAITING:
-                # The track was of nobody.
+                # The track may have been of something else than a person.
                 self.robot.forget()
             answered = True
             self._answer_robot(waiting, tracker, posterior)
@@ -223,7 +223,7 @@ class Track:
         return published
 
     def stale(self, silence: float) -> Iterator[Output]:
-        """Messages for a robot where no image is answered; may be called by any thread.
+        """Yields messages for a robot while no image is answered; may be called by any thread.
 
         Args:
             silence: time since the newest image was answered, s.
@@ -232,7 +232,7 @@ class Track:
             yield replace(made, topic=topic_of(self.person, made.topic))
 
     def _placed_tracker(self, camera: Camera) -> Tracker:
-        """The tracker, which knows gravity and the pose of the camera at the image.
+        """Return the tracker, with gravity and the pose of the camera at the image.
 
         Raises:
             ValueError: no tracker can start.
@@ -259,7 +259,7 @@ class Track:
         self._shared.publish(topic_of(self.person, topic), stamp, message)
 
     def _fixed_frame(self) -> FixedFrame | None:
-        """The frame that is published in; None: that of the camera, or its place is unknown."""
+        """Return the fixed frame to publish in; None if not requested or its pose is unknown."""
         p, pose = self._parameters, self._shared.frames.pose
         if not p.publish_in_fixed_frame or pose is None:
             return None
@@ -305,7 +305,7 @@ class Track:
         return True
 
     def _publish_nobody(self, tracker: Tracker, waiting: WaitingImage) -> None:
-        """The end of a track whose person is no longer in view."""
+        """Publishes the end of a track whose person is no longer in view."""
         for topic, message in nobody_messages(tracker, waiting, self._parameters, self._wants):
             self._put_out(topic, waiting.stamp_ns, message)
         self.weights = np.empty(0)
@@ -319,8 +319,8 @@ class Track:
         """Publishes the outputs for robots.
 
         Args:
-            tracker: after the image; None: it could not be tracked.
-            posterior: of the image; None: there is no track.
+            tracker: the tracker after the image; None if the image could not be tracked.
+            posterior: posterior at the image; None without a track.
         """
         p, fixed = self._parameters, self._fixed_frame()
         placed = fixed is not None or not p.publish_in_fixed_frame
@@ -361,7 +361,7 @@ class Track:
 
 
 def resembles(body: Body, other: Body, tolerance: float) -> bool:
-    """Whether two bodies are of one model, and their lengths differ by a tolerance, m, at most."""
+    """Whether two bodies have the same model, and lengths that agree within a tolerance, m."""
     if (body.name, body.dof_names) != (other.name, other.dof_names):
         return False
     change = np.abs(body.skeleton.lengths - other.skeleton.lengths)

@@ -1,7 +1,7 @@
 """Messages about a tracked image.
 
-`TOPICS` holds names and types; the functions make the messages one after the other, each when it is
-asked for. A message depends on the track and the image alone.
+`TOPICS` has names and types; the functions are generators that make one message at a time. A
+message depends on the track and the image alone.
 """
 
 from __future__ import annotations
@@ -60,16 +60,16 @@ TOPICS = {
     'keep_out': PublishedTopic(KEEP_OUT),
     'pose_forecast': PublishedTopic('hmt_msgs/msg/PoseMixture'),
 }
-# Bags have none: it is large, and follows from keep_out.
+# Not in bags: keep_out_markers are large, and follow from keep_out.
 TOPICS_OF_NODE = {
     **TOPICS,
     'keep_out_markers': PublishedTopic('visualization_msgs/msg/MarkerArray'),
 }
 
-# Frame at the camera with x forward and z up, where gravity is known; a prefix stands before it.
+# Name, after a prefix, of the frame at the camera with x forward and z up, if gravity is known.
 UPRIGHT = 'camera_upright'
 MESSAGES = RosbagsMessages()
-# Modes that are drawn on the image, the heaviest.
+# Maximum number of modes drawn on the image, the heaviest.
 OVERLAY_MODES = 3
 
 
@@ -79,14 +79,13 @@ class TrackedImage:
 
     Attributes:
         waiting: the image.
-        tracker: after the image.
+        tracker: the tracker after the image.
         posterior, likelihood: mixtures over poses, heaviest first.
-        parameters: of the node.
-        frame_prefix: of the names of the links.
-        starts: whether the body is a new one, with other lengths than the image before.
-        describe: whether the URDF is due: a new body, or other names of its frames.
-        fixed: frame that mixtures, markers and the pose of the person are published in; None: the
-            frame of the camera.
+        parameters: parameters of the node.
+        frame_prefix: prefix of the names of the links.
+        starts: whether the body is new, or its lengths have changed since it was published.
+        describe: whether the URDF is due: the body is new, or the names of its frames are.
+        fixed: frame of mixtures, markers and the pose of the person; None: the frame of the camera.
     """
 
     waiting: WaitingImage
@@ -101,10 +100,10 @@ class TrackedImage:
 
 
 def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterator[tuple[str, Any]]:
-    """Topics and messages of a tracked image; mixtures come first, pictures last.
+    """Yields topics and messages of a tracked image, in the order of `TOPICS`.
 
     Raises:
-        MessageError: a mixture that a message must not have.
+        MessageError: a mixture is invalid in a message.
     """
     stamp, frame = track.waiting.stamp_ns, track.waiting.frame_id
     tracker, p = track.tracker, track.parameters
@@ -113,7 +112,7 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
     skeleton = body.skeleton
     joints = forward(tracker.estimate.body.skeleton, posterior.means).joints().transpose(2, 0, 1)
     ground = _ground_state(track)
-    # Both are made before anything is published: either may be invalid for a message.
+    # Both are made before anything is published: either may be invalid in a message.
     made = {
         'pose_mixture': lambda: _posterior(track, joints),
         'likelihood_mixture': lambda: _likelihood(track),
@@ -167,9 +166,9 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
 def nobody_messages(
     tracker: Tracker, waiting: WaitingImage, p: FilterParameters, wanted: Callable[[str], bool]
 ) -> Iterator[tuple[str, Any]]:
-    """Topics and messages of an image that ends a track: nobody is in view, or it was of nobody.
+    """Yields topics and messages of an image that ends a track: nobody is or was in view.
 
-    The overlay shows the image without modes and says why; markers of all ranks are removed.
+    The overlay shows the image without modes and states the reason; all markers are removed.
     """
     body, stamp = tracker.estimate.body, waiting.stamp_ns
     frame = f'{p.fixed_frame}_optical' if p.publish_in_fixed_frame else waiting.frame_id
@@ -204,7 +203,7 @@ def nobody_messages(
 
 
 def notes_of(p: FilterParameters) -> list[str]:
-    """What is missing, for those who look at the overlay."""
+    """Return notes for the overlay on a missing calibration."""
     sigma = p.focal_length_sigma
     return [f'no calibration: distances may be off by {sigma:.0%}'] if sigma else []
 
@@ -215,11 +214,11 @@ def robot_messages(
     wanted: Callable[[str], bool],
     silence: float | None = None,
 ) -> Iterator[Output]:
-    """Messages that robots act on.
+    """Yields the messages that robots act on.
 
     Args:
-        silence: time since the newest image was answered, s, where none comes any more; None: it
-            is being answered.
+        silence: time since the newest image was answered, s, if no other has come; None: it is
+            being answered.
     """
     if wanted('keep_out') or wanted('keep_out_markers'):
         content = robot.keep_out(parameters.keep_out_probability, silence)
@@ -234,7 +233,7 @@ def robot_messages(
 
 
 def _posterior(track: TrackedImage, joints: Array) -> PoseMixture:
-    """The posterior, with joints (K, J, 3) in the camera frame."""
+    """Return the posterior for a message, from joints (K, J, 3) in the camera frame."""
     tracker, posterior = track.tracker, track.posterior
     velocities = tracker.estimate.velocities
     body, frame, positions = tracker.estimate.body, track.waiting.frame_id, joints
@@ -261,9 +260,9 @@ def _posterior(track: TrackedImage, joints: Array) -> PoseMixture:
 
 
 def _likelihood(track: TrackedImage) -> PoseMixture:
-    """The likelihood, which is undiscounted, with the duration of its errors."""
+    """Return the undiscounted likelihood for a message, with its error model."""
     tracker, likelihood, frame = track.tracker, track.likelihood, track.waiting.frame_id
-    # The focal length errs alike in all images, as the shape does.
+    # The error of the focal length is the same in all images, like that of the shape.
     focal = depth_covariances(track.posterior.means[:1], track.parameters.focal_length_sigma)[0]
     body, found = tracker.estimate.body, tracker.estimate.likelihood
     shape = found.shape_covariance + focal
@@ -295,7 +294,7 @@ def _likelihood(track: TrackedImage) -> PoseMixture:
 
 
 def _against_camera(tracker: Tracker) -> tuple[Body, Array]:
-    """The body and its point estimate (d,), root angles measured against the camera."""
+    """Return the body and its point estimate (d,), with root angles relative to the camera."""
     body, point = tracker.estimate.body, tracker.estimate.point_estimate
     upright = body.levelled(np.eye(3))
     return upright, point if upright is body else turned(body, point[None], upright)[0]
@@ -306,7 +305,7 @@ def _state(tracker: Tracker) -> TrackState:
 
 
 def _ground_state(track: TrackedImage) -> GroundState:
-    """Gravity and floor, as a message holds them."""
+    """Return gravity and floor for a message."""
     ground = track.tracker.estimate.ground
     return GroundState(
         track.waiting.stamp_ns,
@@ -320,12 +319,12 @@ def _ground_state(track: TrackedImage) -> GroundState:
 
 
 def _in_range(probabilities: Mapping[str, float]) -> dict[str, float]:
-    """Probabilities by name, which rounding may have taken a little out of their range."""
+    """Clip probabilities to the range 0 to 1, which rounding may exceed."""
     return {name: min(max(float(p), 0.0), 1.0) for name, p in probabilities.items()}
 
 
 def _link_transforms(track: TrackedImage) -> Any:
-    """Every link of the URDF in the point estimate, and frames with z up, from the camera."""
+    """Return the transforms of the URDF links at the point estimate, and of frames with z up."""
     tracker, camera, prefix = track.tracker, track.waiting.frame_id, track.frame_prefix
     links = zip(*links_of(*_against_camera(tracker)), strict=True)
     frames = [(camera, f'{prefix}{name}', *place) for name, *place in links]
@@ -341,5 +340,5 @@ def _link_transforms(track: TrackedImage) -> Any:
 
 
 def links_of(body: Body, pose: Array) -> tuple[list[str], Array, Array]:
-    """Names (L), rotations (L, 3, 3) and origins (L, 3), m, of the links of the URDF in a pose."""
+    """Return names (L), rotations (L, 3, 3) and origins (L, 3), m, of the URDF links in a pose."""
     return link_frames(body.skeleton, forward(body.skeleton, pose[None]), pose, 0)

@@ -1,4 +1,4 @@
-"""Changes of a track, for the log: each is reported once, when it comes."""
+"""Reports of changes of a track for the log, one for each change."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hmt_ros.tracking import Status, Subject, Tracker
 from hmt_ros.tracking.beginning import Source
 from msg_tools.messages.headers import SECOND_NS
 
-# A person hardly moves meanwhile.
+# Maximum age of a subject's joints without a warning, ns: a person hardly moves in that time.
 _SAME_MOMENT_NS = SECOND_NS // 5
 
 
@@ -20,13 +20,13 @@ class TrackCondition(NamedTuple):
     """State of a track that is compared from image to image.
 
     Attributes:
-        status: of the tracker.
-        doubted: whether the background was learned with the person in it, and silhouettes are
-            wanted: keypoints track the person without.
+        status: status of the tracker.
+        doubted: whether the background was learned with the person in it, and the track needs
+            silhouettes: one that started from keypoints does not.
         moved: whether the camera has moved since the background was taken.
-        contradicted: whether scene or person contradict the gravity that is given.
+        contradicted: whether the scene or the person contradicts the given gravity.
         track_id: number of the track.
-        reversed: whether the opposite of the gravity that is given is used.
+        reversed: whether the opposite of the given gravity is used.
     """
 
     status: Status = Status.WAITING
@@ -38,7 +38,7 @@ class TrackCondition(NamedTuple):
 
     @classmethod
     def of(cls, tracker: Tracker | None) -> TrackCondition:
-        """The condition of a tracker; None: it waits."""
+        """Return the condition of a tracker; None represents a tracker that waits."""
         if tracker is None:
             return cls()
         silhouettes = tracker.silhouettes
@@ -61,7 +61,7 @@ def report_change(
     initial: Subject | GaussianMixture | None,
     stamp_ns: int,
 ) -> None:
-    """Reports the changes that came with an image.
+    """Reports the changes of the track at an image.
 
     Args:
         initial: subject or mixture that the track starts from.
@@ -99,7 +99,7 @@ def report_change(
 
 
 def reversed_gravity(up: Array) -> str:
-    """What is told of a reading of an accelerometer that was given for gravity.
+    """Return the text of a warning that an accelerometer reading was given for gravity.
 
     Args:
         up: (3,) unit vector against gravity, camera frame.
@@ -126,7 +126,7 @@ def _report_status(
     if now is Status.NOBODY:
         log.tell(f'nobody in view {at}: {track} ends, another starts when somebody comes')
     elif now is Status.WAITING:
-        log.tell(f'{track} ends {at}: whoever is there may be somebody else')
+        log.tell(f'{track} ends {at}: the person in view may be somebody else')
     elif tracker.track_id == before.track_id and before.status is Status.LOST:
         log.tell(f'{track} is found again {at}')
     elif tracker.track_id != before.track_id:
@@ -138,7 +138,6 @@ def _report_status(
         log.tell(f'{track} starts from {origin} {at}')
         if isinstance(initial, Subject) and before.status is Status.WAITING:
             age = stamp_ns - initial.stamp_ns
-            # Warns of a start from joints that were seen long before.
             if age > _SAME_MOMENT_NS:
                 log.note(
                     'old start',

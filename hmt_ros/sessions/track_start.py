@@ -27,12 +27,12 @@ class TrackStart:
     """Everything that a new tracker needs besides the camera.
 
     Attributes:
-        parameters: of the track.
-        body: the model, or for a mixture the body that its poses are of.
-        background: (H, W, 3) BGR image of the empty scene, or None: to be learned.
+        parameters: parameters of the track.
+        body: body of the poses: the model, or the body of an initial mixture.
+        background: (H, W, 3) BGR image of the empty scene; None: the background is learned.
         initial: prior of the first image; None: keypoints, a mask or a prediction start the track.
-        box: (left, top, right, bottom) in which the person is in the next image, px, before
-            `initial`; None: unknown.
+        box: (left, top, right, bottom) that contains the person in the next image, px; it takes
+            precedence over `initial`. None: unknown.
     """
 
     parameters: FilterParameters
@@ -42,10 +42,10 @@ class TrackStart:
     box: Box | None = None
 
     def wants(self, sources: tuple[str, ...]) -> str:
-        """Inputs that have to come before the track starts, in words.
+        """Return the inputs that the start of the track waits for, in words.
 
         Args:
-            sources: that may start a track where nothing is given.
+            sources: inputs that may start a track if no start is given.
         """
         if self.box is not None or isinstance(self.initial, GaussianMixture):
             return 'an image'
@@ -65,14 +65,14 @@ class TrackStart:
         ground: KnownGround,
         shared: BackgroundModel | None = None,
     ) -> Tracker:
-        """A tracker that waits for its first image.
+        """Return a tracker that waits for its first image.
 
         Args:
             ground: gravity and floor, as far as they are known.
-            shared: background of several people, which is learned elsewhere; None: an own one.
+            shared: background that several people share, learned elsewhere; None: its own.
 
         Raises:
-            ValueError: the background was taken by another camera, or the box is not in its image.
+            ValueError: the background was taken by another camera, or the box is not in the image.
         """
         p = self.parameters
         background = self.background_model(camera) if shared is None else shared
@@ -89,10 +89,10 @@ class TrackStart:
         return tracker
 
     def background_model(self, camera: Camera) -> BackgroundModel:
-        """The empty scene before a camera, as far as it is known.
+        """Return the background model for a camera; it is unknown if no background is given.
 
         Raises:
-            ValueError: it was taken by another camera.
+            ValueError: the background was taken by another camera.
         """
         if self.background is None:
             return BackgroundModel()
@@ -115,14 +115,14 @@ def prepare_start(
 
     Args:
         mixture: hmt_msgs/PoseMixture to start from; without components or None: the subject file.
-        present: body of the present track, if any: a mixture without segment lengths is about it.
-        region: sensor_msgs/RegionOfInterest in which the person is; None, or of no width: unknown.
+        present: body of the present track, if any; a mixture without segment lengths refers to it.
+        region: sensor_msgs/RegionOfInterest of the person; None, or of no width: unknown.
 
     Raises:
-        ValueError: a file or a mixture that can not be used; one line that says why.
+        ValueError: a file or the mixture can not be used; one line with the reason.
     """
     body = _body(parameters.body_model)
-    known_lifter(parameters.tracker.lifter)  # a tracker takes it once the camera is known
+    known_lifter(parameters.tracker.lifter)  # only a check; the tracker loads it with the camera
     background = read_picture(parameters.background_file) if parameters.background_file else None
     initial: Subject | GaussianMixture | None = None
     if mixture is not None and len(mixture.components):

@@ -1,10 +1,10 @@
-"""The people before one camera, one track for each: here of one person, for the filter.
+"""Session of the filter: tracks one person before a camera; `PeopleSession` tracks several.
 
 The rules, besides those of `CameraSession`:
 
 - An image waits for the inputs that are used (`image_inputs`); keypoints without names, and
-  mixtures without components, say that nobody was seen.
-- A camera_info with another calibration, and ~/reset, start the tracks anew.
+  mixtures without components, mean that nobody was seen.
+- A camera_info with another calibration, and ~/reset, restart the tracks.
 """
 
 from __future__ import annotations
@@ -52,16 +52,16 @@ class TrackingState(CameraState):
     """State of the filter: its status is 'no camera', or a value of `Status`.
 
     Attributes:
-        body: of the present track; None: there is none.
-        modes: components of the posterior.
-        misfit: share of the image that no mode explains.
-        evaluations: of the likelihood in the last image.
-        background: its state, in a few words.
-        doubted: whether it was learned with the person in it, and is not known again.
-        track_id: number of the present track, or of the last one; 0 before the first.
-        started_from: input that this track began from; '' before the first.
-        existence: probability that a person is in view; NaN: no image yet.
-        beliefs: probability that each cue shows the person, and that the track has the person.
+        body: body of the present track; None without a track.
+        modes: number of components of the posterior.
+        misfit: fraction of the image that no mode explains.
+        evaluations: number of evaluations of the likelihood in the last image.
+        background: state of the background, in a few words.
+        doubted: whether the background was learned with the person in it, and is still unknown.
+        track_id: number of the present or last track; 0 before the first.
+        started_from: input that the track started from; '' before the first.
+        existence: probability that a person is in view; NaN before the first image.
+        beliefs: probability that each cue shows the person, and that the track follows the person.
     """
 
     body: Body | None = None
@@ -80,7 +80,7 @@ class TrackingState(CameraState):
         return f'{self.modes} modes'
 
     def trouble(self) -> str:
-        """Whether the track is lost, nobody is in view, or the background is of no use."""
+        """Return whether the track is lost, nobody is in view or the background is unusable."""
         if self.status == Status.NOBODY.value:
             return 'nobody in view'
         if self.status == Status.LOST.value:
@@ -108,8 +108,8 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
     """Tracks the people before one camera; see `Session` for arguments and attributes.
 
     Attributes:
-        start: of the tracks.
-        tracks: of the people; here there is always one.
+        start: start of the tracks.
+        tracks: tracks of the people; always one in this class.
     """
 
     TOPICS: ClassVar[Mapping[str, PublishedTopic]] = TOPICS_OF_NODE
@@ -140,15 +140,15 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
 
     @property
     def answered(self) -> int:
-        """Number of answers to images that went to robots."""
+        """Number of images that were answered for robots."""
         return self._shared.answered
 
     def restart(self, start: TrackStart | None = None) -> None:
         """Drops the tracks; new ones start with the images that follow.
 
         Args:
-            start: of the new tracks; None: by the parameters or, where these name a file that can
-                not be used, as the time before.
+            start: start of the new tracks; None: from the parameters or, if these name a file that
+                can not be used, the previous start.
         """
         if start is None:
             try:
@@ -163,11 +163,11 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
         super().restart()
 
     def stale(self, silence: float, answered: int) -> list[Output]:
-        """Messages for robots where no image is answered; may be called by any thread.
+        """Return messages for robots while no image is answered; may be called by any thread.
 
         Args:
             silence: time since the newest image was answered, s.
-            answered: as `answered` was then; if it has risen, there are no messages.
+            answered: value of the attribute at that time; if it has risen, there are no messages.
         """
         with self._shared.answering:
             if answered != self.answered:
@@ -175,7 +175,7 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
             return [made for track in self.tracks for made in track.stale(silence)]
 
     def forecast(self, stamp_ns: int) -> Any:
-        """hmt_msgs/PoseMixture at a time, see `RobotOutputs`; may be called by any thread."""
+        """Return hmt_msgs/PoseMixture at a time, see `RobotOutputs`; callable from any thread."""
         return pose_mixture_message(self._messages, self.tracks[0].robot.forecast(stamp_ns))
 
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
@@ -186,7 +186,7 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
             self._log.prefix = f'{track.person}: ' if track.person else ''
             outcomes.add(track.follow(waiting, camera, seen, self.parameters))
             self._log.prefix = ''
-        # Those are counts of images, not of people.
+        # The counts are of images, not of people.
         if True in outcomes:
             self._log.counts['tracked'] += 1
         elif False in outcomes:
@@ -194,14 +194,14 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
 
     def _jump_back(self, first: int, last: int) -> None:
         super()._jump_back(first, last)
-        # Where time begins again, so do the numbers of the tracks.
+        # The numbers of the tracks restart with time.
         self._keypoints.chosen.forget()
         self._begin()
 
-    # One person; several override these.
+    # Methods for one person; `PeopleSession` overrides them.
 
     def _begin(self) -> None:
-        """Nothing has been tracked."""
+        """Sets the state in which nothing has been tracked."""
         self.tracks = (Track('', self.parameters, self.start, self._shared),)
 
     @classmethod
@@ -220,13 +220,13 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
         return super()._read_input(row, message, stamp)
 
     def _prediction_in(self, message: Any) -> PosePrediction | Status | None:
-        """The mixture and its body, see `body_of`; `NOBODY`: nobody was seen; None: no prediction.
+        """Return the mixture with its body; `NOBODY` if nobody was seen; None if not predicted.
 
         Raises:
-            ValueError: it can not be used; one line.
+            ValueError: the message can not be used; one line.
         """
         if len(message.components) == 0:
-            # A predictor that leaves the image to the track has seen neither somebody nor nobody.
+            # A predictor that leaves an image to the track does not know whether nobody is there.
             left = message.state == TrackState.TRACKING or getattr(message, 'reason', '')
             return None if left else Status.NOBODY
         try:
@@ -236,7 +236,7 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
             raise ValueError(f'pose_prediction: {error}') from error
 
     def _people_in(self, waiting: WaitingImage, camera: Camera) -> Iterator[tuple[Track, Seen]]:
-        """The tracks, and what an image shows of each; a track follows it before the next one."""
+        """Yields each track with its evidence; the track is updated before the next is yielded."""
         keypoints = self._keypoints.at_joints(
             waiting.content(KEYPOINTS),
             waiting.content(KEYPOINTS_3D),
@@ -244,7 +244,7 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
             self.parameters.keypoint_scheme,
             waiting.stamp_ns,
         )
-        # A person moves little until the next image: a prediction is a hypothesis there, too.
+        # A person moves little between images: a late prediction is still a useful hypothesis.
         taken = self._inputs[PREDICTION].take_all(waiting.stamp_ns).values()
         known = [one for one in taken if one is not None and self.parameters.use_predictions]
         prediction = known[-1] if known else None

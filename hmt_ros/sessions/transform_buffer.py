@@ -24,19 +24,19 @@ from msg_tools.messages.headers import SECOND_NS, time_ns
 TF, TF_STATIC = TRANSFORMS = ('tf', 'tf_static')
 TRANSFORMS_TYPE = 'tf2_msgs/msg/TFMessage'
 
-# Time that a moving frame is remembered, as in tf2, s, and bounds that a flood of messages meets.
+# Time that moving frames are remembered, as in tf2, s; maximum numbers of frames and of stamps.
 REMEMBERED = 10.0
 MOST_FRAMES, MOST_STAMPS = 1000, 10_000
-# Most that the length of a quaternion differs from 1; tf2 takes half of it.
+# Maximum deviation of the length of a quaternion from 1, twice that of tf2.
 _NOT_UNIT = 1e-2
-# Cosine of half the angle between two rotations so close that a line replaces the arc.
+# Cosine of half the angle between two rotations above which interpolation is linear.
 _CLOSE = 0.9995
-# Names of frames in a message for people.
+# Maximum number of names of frames in an error.
 _LISTED = 12
 
 
 class TransformError(ValueError):
-    """There is no transform between two frames at a time: one line that says why."""
+    """No transform between two frames is known at a time; the text is one line with the reason."""
 
 
 class Transform(NamedTuple):
@@ -51,14 +51,14 @@ class Transform(NamedTuple):
     translation: Array
 
     def after(self, inner: Transform) -> Transform:
-        """The transform that applies this one to the results of another."""
+        """Return the transform that applies `inner` first and then this one."""
         return Transform(
             product(self.rotation, inner.rotation),
             product(self.rotation, inner.translation) + self.translation,
         )
 
     def inverse(self) -> Transform:
-        """The transform back."""
+        """Return the inverse transform."""
         back = self.rotation.T
         return Transform(back, product(-back, self.translation))
 
@@ -75,22 +75,22 @@ class _Sample(NamedTuple):
 
 
 class _Frame:
-    """Places of a frame.
+    """Places of a frame over time.
 
     Attributes:
-        static: place at all times; None: the frame moves.
-        places: of a frame that moves: stamps, ns, increasing, with the places then.
+        static: place at all times; None if the frame moves.
+        places: stamps, ns, and places of a moving frame, in the order of the stamps.
     """
 
     def __init__(self, static: _Sample | None = None) -> None:
         self.static = static
         self.places: list[tuple[int, _Sample]] = []
-        # A place of quite another time, until the next one says whether that is true.
+        # A place at a distant time, until the next one confirms that time or not.
         self._aside: tuple[int, _Sample] | None = None
 
     @property
     def parent(self) -> str:
-        """The newest parent."""
+        """Newest parent of the frame."""
         newest = self.places[-1][1] if self.static is None else self.static
         return newest.parent
 
@@ -107,7 +107,7 @@ class _Frame:
         del self.places[: max(old, len(self.places) - MOST_STAMPS)]
 
     def at(self, stamp: int) -> _Sample | None:
-        """The place at a time; None: it lies outside of the known ones."""
+        """Return the place at a time; None if the time is outside of the known ones."""
         if self.static is not None:
             return self.static
         after = self.first(stamp)
@@ -126,25 +126,25 @@ class _Frame:
         )
 
     def first(self, stamp: int) -> int:
-        """Index of the first place that is not older."""
+        """Return the index of the first place that is not older than a stamp."""
         return bisect_left(self.places, stamp, key=lambda place: place[0])
 
 
 class TransformBuffer:
-    """Remembers transforms and joins them along the tree of frames."""
+    """Stores transforms and composes them along the tree of frames."""
 
     def __init__(self) -> None:
         self._frames: dict[str, _Frame] = {}
 
     def put(self, message: Any, *, static: bool) -> list[str]:
-        """Takes a tf2_msgs/TFMessage.
+        """Stores the transforms of a tf2_msgs/TFMessage.
 
         Args:
-            message: of `rosbags` or of ROS.
-            static: whether it comes from /tf_static.
+            message: message of `rosbags` or of ROS.
+            static: whether it is from /tf_static.
 
         Returns:
-            Why transforms in it were not taken, a line for each.
+            A line for each transform that was rejected, with the reason.
         """
         faults = []
         for stamped in message.transforms:
@@ -156,15 +156,15 @@ class TransformBuffer:
         return faults
 
     def forget_after(self, stamp_ns: int) -> None:
-        """Forgets places of moving frames after a time, to which time has jumped back."""
+        """Removes the places of moving frames after a time to which the clock has jumped back."""
         for frame in self._frames.values():
             del frame.places[frame.first(stamp_ns + 1) :]
         self._frames = {name: x for name, x in self._frames.items() if x.static or x.places}
 
     def has_later(self, stamp_ns: int, timeout_ns: float) -> bool:
-        """Whether a frame is known at a time that is later by more than a timeout.
+        """Whether any moving frame has a place that is later by more than a timeout.
 
-        One that is known later by far says nothing of the others.
+        A place that is much later is no evidence on other frames.
         """
         longest = timeout_ns + REMEMBERED * SECOND_NS
         return any(
@@ -174,15 +174,15 @@ class TransformBuffer:
         )
 
     def frames(self) -> list[str]:
-        """Names of all frames, sorted."""
+        """Return the names of all frames, sorted."""
         return sorted(self._frames.keys() | {frame.parent for frame in self._frames.values()})
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Transform:
-        """The transform p_target = R p_source + t at a time.
+        """Return the transform p_target = R p_source + t at a time.
 
         Raises:
-            TransformError: a frame is not known, the frames are not connected or form a loop, or
-                there is no transform of that time.
+            TransformError: a frame is unknown, the frames are not connected or form a loop, or no
+                transform is known at that time.
         """
         target, source = _name(target), _name(source)
         from_target, why = self._to_root(target, stamp_ns)
@@ -224,7 +224,7 @@ class TransformBuffer:
         known.put(time_ns(stamped.header.stamp), sample)
 
     def _to_root(self, frame: str, stamp_ns: int) -> tuple[dict[str, Transform], str]:
-        """Transforms from a frame to each frame above it; why there are no more, '' at the root."""
+        """Return the transforms from a frame to its ancestors, and why they end; '' at the root."""
         reached = {frame: Transform(np.eye(3), np.zeros(3))}
         here, total = frame, reached[frame]
         while (known := self._frames.get(here)) is not None:
@@ -243,7 +243,7 @@ class TransformBuffer:
 
 
 def rotation_matrix(quaternion: Array) -> Array:
-    """Rotation (3, 3) of a unit quaternion (4,) x y z w."""
+    """Return the rotation (3, 3) of a unit quaternion (4,) x y z w."""
     x, y, z, w = quaternion
     return np.array(
         [
@@ -255,7 +255,7 @@ def rotation_matrix(quaternion: Array) -> Array:
 
 
 def slerp(start: Array, end: Array, share: float) -> Array:
-    """Unit quaternion (4,) on the shortest arc from one to another (Shoemake 1985)."""
+    """Interpolate unit quaternions (4,) on the shortest arc (Shoemake 1985)."""
     cosine = float(product(start, end))
     if cosine < 0:
         end, cosine = -end, -cosine
@@ -268,7 +268,7 @@ def slerp(start: Array, end: Array, share: float) -> Array:
 
 
 def _name(frame: Any) -> str:
-    """Name of a frame as tf2 has it, without the slash of old."""
+    """Return the name of a frame as in tf2, without a leading slash as in tf."""
     return str(frame).removeprefix('/')
 
 

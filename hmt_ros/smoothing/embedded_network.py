@@ -62,7 +62,7 @@ def embedded_network(
     covariances = np.concatenate([mixture.covariances for mixture in mixtures])
     different, which = np.unique(intervals, return_inverse=True)
 
-    # Expected place and spread of every mode at the next time.
+    # Predicted mean and covariance of every mode at the next time.
     predicted, spread = np.empty_like(means), np.empty_like(covariances)
     for i, interval in enumerate(different):
         a, q = dynamics.transition(float(interval))
@@ -137,12 +137,12 @@ class Paths:
         return len(self.log_values)
 
     def __getitem__(self, index: Index) -> Paths:
-        """Some of the paths, in the order of the index."""
+        """Select paths, in the order of the index."""
         return Paths(self.nodes[index], self.log_values[index])
 
     @property
     def weights(self) -> Array:
-        """Probabilities (P,) of the paths among themselves."""
+        """Probabilities (P,) of the paths, normalised over them."""
         return np.asarray(elementary.exp(self.log_values - log_sum_exp(self.log_values)))
 
 
@@ -159,7 +159,7 @@ def k_best_paths(network: EmbeddedNetwork, k: int) -> Paths:
     sources = len(network.nodes[0])
     # best (sources, nodes, rank); a path that does not exist has value -inf.
     best = np.where(np.eye(sources, dtype=bool), network.nodes[0][:, None], -np.inf)[:, :, None]
-    # Where each kept path comes from, and how many were kept there per source and node.
+    # Predecessor of each kept path, and number of kept paths per source and node.
     back: list[tuple[Index, int]] = []
     for t, links in enumerate(network.links):
         before, after = links.shape

@@ -1,13 +1,13 @@
-"""Motions refined on what the images themselves show (VMS 5 and 6).
+"""Refinement of motions by the likelihood of the images themselves (VMS 5 and 6).
 
     E(X) = -log p(x_1) - sum_t log p(x_t | x_(t-1)) - sum_t log p(r_t | x_t)                    (1)
     F(q) = E_q[log q(X) - log p(X, R)],    q = sum_i a_i N(M_i, s_i^2 S_i)                      (2)
 
-The distinct motions of a window start descents on (1) within limits, with one prior for all: that
-of the liveliest among them, with the feet held that rest in the heaviest. Of optima that are one
-motion the most probable is kept; (2) is over these. What it adapts is chosen on clips
-(docs/smoothing.md): the chain of the filter's modes weighs motions better than (2), so an optimum
-has the weight of the motions that came to it.
+The distinct motions of a window start descents on (1) within limits. All use one prior: that of the
+motion with the largest noise factor, with the feet fixed that rest in the heaviest motion. Of
+optima that are one motion the most probable is kept; (2) is over these. Its adapted variables were
+chosen on clips (docs/smoothing.md): the chain of the filter's modes weighs motions better than (2),
+so an optimum gets the total weight of the motions that converged to it.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import refine
 from hmt_ros.smoothing.variational_mixture import minimise_free_energy
 
-# Motions that are refined at most, and the least share of weight of one.
+# Maximum number of refined motions, and minimum weight of one.
 MOST, LEAST = 4, 0.01
-# Steps of a descent at most, and the gain of a step that ends it, nats.
+# Maximum number of steps of a descent, and gain of a step below which it ends, nats.
 STEPS, TOLERANCE = 30, 0.01
-# Samples of each optimum, and iterations, of the descent of the free energy.
+# Number of samples per optimum, and of iterations, of the descent of the free energy.
 SAMPLES, ITERATIONS = 4, 15
 
 
@@ -42,20 +42,19 @@ def refined_on_images(
     *,
     adapt: Sequence[str] = ('inflation',),
 ) -> TrajectoryMixture:
-    """The motions of a window, of which those that are distinct are refined.
+    """Refine the distinct motions of a window.
 
     Args:
-        smoother: that has found them.
-        found: motions of a whole sequence, of whose past nothing is known.
-        images: of the window, one for each time.
-        adapt: what the free energy adapts, some of 'weights' and 'inflation'.
+        smoother: smoother of the motions.
+        found: motions of a whole sequence, without a past.
+        images: likelihood of the images of the window, one for each time.
+        adapt: variables of the free energy, some of 'weights' and 'inflation'.
 
     Returns:
-        The distinct optima, and the motions beside these as they were; with the free energy of the
-        optima.
+        The distinct optima, and the other motions unchanged; with the free energy of the optima.
 
     Raises:
-        ValueError: another number of images.
+        ValueError: the number of images is wrong.
     """
     motions, low_high = found.trajectories, smoother.limits()
     assert motions.stamps_ns is not None
@@ -81,7 +80,7 @@ def refined_on_images(
     origin = chosen[optima.starts]
     kept, labels = _first_of_each(smoother, motions, optima.states, motions.weights[origin], 0.0)
     optima, others = optima[kept], np.setdiff1d(np.arange(len(motions)), chosen)
-    # Which component each motion has become.
+    # Component of the result of each motion.
     count = len(kept)
     into = np.zeros((len(motions), count + len(others)))
     into[origin, labels] = 1.0
@@ -133,7 +132,7 @@ def _first_of_each(
     weights: Array,
     least: float,
 ) -> tuple[Index, Index]:
-    """The first of states (N, T, n) that are one motion, for each motion; and the motion (N,)."""
+    """Return the first of states (N, T, n) of each motion, and the motion (N,) of each."""
     assert motions.stamps_ns is not None
     points = smoother.points_of(states[:, :, : motions.dimension]).swapaxes(0, 1)
     nodes = np.broadcast_to(np.arange(len(states))[:, None], states.shape[:2])

@@ -1,6 +1,6 @@
 """Likelihoods of observations for a smoother: -log p(r_t | x_t), its gradient and its curvature.
 
-The mixtures that a filter made, `MixtureLikelihood`, or any other `EnergyTerm` whose rows are
+They are the mixtures of a filter, `MixtureLikelihood`, or any other `EnergyTerm` whose rows are
 times, such as the images themselves (VMS 5).
 """
 
@@ -31,7 +31,7 @@ class SequenceLikelihood(EnergyTerm, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class MixtureLikelihood:
-    """p(r_t | x_t) = sum_k w_k N(x_t; m_k, S_k), the mixtures as a filter sends them.
+    """p(r_t | x_t) = sum_k w_k N(x_t; m_k, S_k), the mixtures of a filter.
 
     With y_k = W_k (x - m_k), S_k^-1 = W_k' W_k, responsibilities r_k and u_k = W_k' y_k, the
     gradient of -log p is u = sum_k r_k u_k and its Hessian sum_k r_k S_k^-1 - (sum_k r_k u_k u_k' -
@@ -116,9 +116,9 @@ class LikelihoodPart:
     """The likelihood of some consecutive times.
 
     Attributes:
-        whole: of all times.
-        first: the first of them.
-        times: how many.
+        whole: likelihood of all times.
+        first: index of the first time.
+        times: number of times.
     """
 
     whole: SequenceLikelihood
@@ -133,7 +133,7 @@ class LikelihoodPart:
 
 
 def counted(mixture: GaussianMixture, share: float) -> GaussianMixture:
-    """The likelihood of an observation of which only a share a is new information.
+    """Discount the likelihood of an observation of which only a share a is new information.
 
         sum_k v_k N(m_k, S_k / a) / sum_k v_k,        v_k = w_k^a |S_k|^((1 - a) / 2)
 
@@ -160,7 +160,7 @@ def check_mixtures(mixtures: Sequence[GaussianMixture]) -> None:
     """Checks that the mixtures of a window, one for each time, can be smoothed.
 
     Raises:
-        ValueError: a mixture that can not be smoothed, with its place.
+        ValueError: a mixture can not be smoothed; the message has its index.
     """
     if len(mixtures) == 0:
         raise ValueError('no mixtures to smooth; wanted one for each time')

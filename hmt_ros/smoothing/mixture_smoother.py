@@ -26,17 +26,17 @@ from hmt_ros.smoothing.variational_mixture import (
     minimise_free_energy,
 )
 
-# Noise values that the descent of the free energy holds: few samples where the state is large.
+# Maximum number of noise values in the descent of the free energy; limits the number of samples.
 SAMPLE_BUDGET = 400_000
-# Components lighter than this, against the heaviest, do not take part in the descent.
+# Minimum weight of a component in the descent, relative to the heaviest one.
 LEAST_SHARE = 1e-6
-# From this many images on, paths are first refined where they leave the best one, and by so many
-# images on either side.
+# Number of images from which paths are first refined where they differ from the best one; margin of
+# such a part on either side, images.
 LONG = 100
 MARGIN = 8
-# A path whose Gaussian lies within so many standard deviations of an optimum says nothing new.
+# Distance from an optimum below which the Gaussian of a path is redundant, standard deviations.
 SAME_DISTANCE = 0.3
-# Modes closer than so many standard deviations are merged, as alternatives to the optima.
+# Distances below which modes are merged, as alternatives to the optima, standard deviations.
 MERGE_DISTANCES = (1.75, 2.5)
 
 
@@ -45,14 +45,14 @@ class MixtureSmoother:
     """Smooths sequences of mixtures whose errors are independent; else see `likelihood.counted`.
 
     Attributes:
-        dynamics: of the state.
+        dynamics: dynamics of the state.
         lower, upper: (d,) limits of the pose at every time; None: none.
-        max_trajectories: components of the result at most.
+        max_trajectories: maximum number of components of the result.
         adapt: variables of the descent of the free energy, some of `ADAPTABLE`; empty: no descent.
-        max_iterations: of the descent of the free energy.
+        max_iterations: maximum number of iterations of the descent of the free energy.
 
     Raises:
-        ValueError: settings out of range.
+        ValueError: a setting is out of range.
     """
 
     dynamics: LinearGaussianDynamics
@@ -78,16 +78,17 @@ class MixtureSmoother:
         stamps_ns: Sequence[int] | None = None,
         observation: SequenceLikelihood | None = None,
     ) -> TrajectoryMixture:
-        """The mixture over trajectories given likelihood mixtures, one for each time.
+        """Smooth likelihood mixtures, one for each time, to a mixture over trajectories.
 
         Args:
-            mixtures: T likelihoods over the pose; weights need not sum to 1.
+            mixtures: T likelihoods over the pose, whose weights need not sum to 1.
             stamps_ns: (T,) times, increasing; None: one `dynamics.step` apart.
-            observation: likelihood in refinement and free energy, for example that of the images
-                themselves; the mixtures then give the starts. None: that of the mixtures.
+            observation: likelihood for refinement and free energy, for example of the images
+                themselves; the mixtures then only give the initial paths. None: the likelihood of
+                the mixtures.
 
         Raises:
-            ValueError: mixtures or stamps that can not be smoothed; the message says which.
+            ValueError: mixtures or stamps can not be smoothed; the message says why.
         """
         check_mixtures(mixtures)
         if mixtures[0].dimension != self.dynamics.dimension:
@@ -109,7 +110,7 @@ class MixtureSmoother:
         stamps_ns: Sequence[int] | None = None,
         observation: SequenceLikelihood | None = None,
     ) -> TrajectoryMixture:
-        """As `smooth`, of inputs that were checked."""
+        """Smooth checked inputs; see `smooth`."""
         likelihood = sequence.likelihood if observation is None else observation
         best, least = self.optima(sequence, likelihood), np.nan
         for other in self.merged_paths(sequence) if observation is None else ():
@@ -121,11 +122,11 @@ class MixtureSmoother:
         return self._fitted(best, sequence.prior, likelihood, seed, stamps_ns)
 
     def paths(self, sequence: ModeSequence) -> Paths:
-        """The paths that trajectories start from."""
+        """Return the initial paths of trajectories."""
         return sequence.paths(self.max_trajectories)
 
     def optima(self, sequence: ModeSequence, likelihood: SequenceLikelihood) -> TrajectoryGaussians:
-        """Distinct optima, found from the paths, and paths beside them if they are few."""
+        """Return distinct optima of the paths, and further paths if the optima are few."""
         low, high = self._limits()
         prior, paths = sequence.prior, self.paths(sequence)
         d = prior.dimension
@@ -160,7 +161,7 @@ class MixtureSmoother:
         )
 
     def merged_paths(self, sequence: ModeSequence) -> Iterator[TrajectoryGaussians]:
-        """Gaussians of paths through modes that were merged, for each distance that merges some."""
+        """Yield Gaussians of paths through merged modes, for each distance that merges any."""
         count = sum(len(mixture) for mixture in sequence.mixtures)
         for distance in MERGE_DISTANCES:
             merged = sequence.merged(distance)
@@ -188,7 +189,7 @@ class MixtureSmoother:
         seed: int,
         max_iterations: int,
     ) -> VariationalMixture:
-        """Descent over the components that count; the others stay as they are."""
+        """Optimise the heavy components; the others are unchanged."""
         low, high = self._limits()
         weights, means = candidates.weights, candidates.states.copy()
         heavy = weights > LEAST_SHARE * weights.max()
@@ -222,7 +223,7 @@ class MixtureSmoother:
         seed: int,
         stamps_ns: Sequence[int] | None,
     ) -> TrajectoryMixture:
-        """The mixture that is closest to the posterior, from the candidates on."""
+        """Fit the mixture that is closest to the posterior, starting from the candidates."""
         iterations = self.max_iterations if self.adapt else 0
         found = self._descended(candidates, prior, likelihood, seed, iterations)
         result = trajectory_mixture(
@@ -257,11 +258,11 @@ def trajectory_mixture(
     low: Array,
     high: Array,
 ) -> TrajectoryMixture:
-    """The components, heaviest first, with their log joint densities.
+    """Build the mixture, heaviest component first, with log joint densities.
 
     Args:
         weights, states, factors, inflation, stamps_ns: as for `TrajectoryMixture`.
-        prior, likelihood: of the states, and of the poses.
+        prior, likelihood: prior of the states and likelihood of the poses.
         low, high: (n,) limits of the states.
     """
     order = np.argsort(-weights, kind='stable')
@@ -293,14 +294,14 @@ def with_refined_parts(
     lower: Array,
     upper: Array,
 ) -> Array:
-    """Starts (M, T, n) that are optimal where they differ from the first one, given the rest.
+    """Optimise the parts of initial trajectories (M, T, n) that differ from the first one.
 
-    The paths of a long sequence agree but for its ends, and many have the same ends: their parts
+    The paths of a long sequence agree except at its ends, and many share the same ends. Their parts
     are few and short, while each step of a whole trajectory costs as much as all its images.
 
     Args:
-        starts: (M, T, n); the first one is an optimum.
-        shared: (M, T) whether they are as the first one.
+        starts: (M, T, n) initial trajectories; the first one is an optimum.
+        shared: (M, T) whether each state equals that of the first one.
     """
     times = starts.shape[1]
     parts: dict[tuple[int, int], list[int]] = {}
@@ -327,10 +328,10 @@ def with_refined_parts(
 
 
 def intervals_of(stamps_ns: Sequence[int] | None, times: int, step: float) -> Array:
-    """Intervals (T-1,) in seconds.
+    """Return the intervals (T-1,), s.
 
     Raises:
-        ValueError: another number of stamps, or stamps that do not increase.
+        ValueError: the number of stamps is wrong, or a stamp does not increase.
     """
     if stamps_ns is None:
         return np.full(times - 1, step)

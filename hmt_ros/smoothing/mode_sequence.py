@@ -1,8 +1,8 @@
 """The modes of a sequence of mixtures under a dynamical model, and the Gaussians of their paths.
 
-Modes that overlap are one explanation of the observation rather than two. Where they are merged
-into one Gaussian with their mean and covariance, a path stands for all paths through the merged
-modes, and few trajectories cover the same posterior as many (VMS 4).
+Overlapping modes are one explanation of the observation rather than two. If they are merged into
+one Gaussian with their mean and covariance, a path represents all paths through the merged modes,
+and fewer trajectories cover the same posterior (VMS 4).
 
 Where the likelihood is a mixture at every time, the posterior is a mixture too, with a component
 for every path k = (k_1 .. k_T):
@@ -11,8 +11,8 @@ for every path k = (k_1 .. k_T):
 
     log w_k = sum_t log (w_{k_t} N(0; m_{k_t}, S_{k_t})) + (M_k' P_k M_k - log |P_k / 2 pi|) / 2 - c
 
-with P, h and c those of the prior. Modes that overlap have fewer optima than paths; where optima
-are few, these Gaussians stand beside them.
+with P, h and c those of the prior. Overlapping modes have fewer optima than paths; if there are few
+optima, these Gaussians complement them.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from hmt_ros.smoothing.embedded_network import (
 )
 from hmt_ros.smoothing.likelihood import MixtureLikelihood
 
-# Candidates for each path that is chosen.
+# Number of candidates per selected path.
 CANDIDATES = 4
 
 
@@ -51,7 +51,7 @@ class ModeSequence:
 
     Attributes:
         mixtures: over the d variables of the pose, T of them.
-        dynamics: of the state, n variables.
+        dynamics: dynamics of the state of n variables.
         intervals: (T-1,) s.
     """
 
@@ -75,7 +75,7 @@ class ModeSequence:
         return embedded_network(self.mixtures, self.dynamics, self.intervals)
 
     def paths(self, count: int) -> Paths:
-        """At most `count` paths that are probable and differ from each other.
+        """Return at most `count` probable paths that differ from each other.
 
         The best of each pair of ends; where that makes less, further ones of the same pairs.
         """
@@ -95,7 +95,7 @@ class ModeSequence:
         return result
 
     def merged(self, distance: float) -> ModeSequence:
-        """The sequence with modes merged that are closer than so many standard deviations."""
+        """Merge modes closer than a distance, in standard deviations."""
         mixtures = tuple(merged_if_close(mixture, distance) for mixture in self.mixtures)
         return replace(self, mixtures=mixtures)
 

@@ -1,14 +1,14 @@
-"""The states of motions: smoothed along what the images say of each (VMS 5, in closed form).
+"""The states of motions, smoothed over the evidence of the images (VMS 5, in closed form).
 
     E(X) = |x_1 - m_1|^2_(P_1) / 2 + sum_t |x_(t+1) - A x_t|^2_(l_t Q) / 2
            + sum_t |x_t - z_t|^2_(R_t) / 2
 
-z_t and R_t are the motion's modes in an image (`motions`), N(m_1, P_1) is the state predicted by
-the motions that its paths come from. l_t is how much livelier the motion is than the prior of
-people's motion: the least of 1, 4, 16, 64 with which the states stay with the modes whose motion
-they are. An image whose modes are far from the states is wrong, and counts little. A motion whose
-past is far from all its modes begins without it. E is a parabola with a block-tridiagonal Hessian;
-states beyond limits are moved onto them.
+z_t and R_t are the mean and covariance of the motion's modes in an image (`motions`), N(m_1, P_1)
+is the state that the motion's past predicts. l_t scales the noise of the motion prior: it is the
+least of 1, 4, 16, 64 with which the states stay close to the motion's modes. An image whose modes
+are far from the states is taken for wrong and gets a low weight. A motion whose past is far from
+all its modes starts without this past. E is quadratic with a block-tridiagonal Hessian; states
+beyond limits are clipped to them.
 """
 
 from __future__ import annotations
@@ -46,27 +46,26 @@ from hmt_ros.smoothing.motions import (
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import limits_of_states
 
-# Paths that are drawn from the chain.
+# Number of paths drawn from the chain.
 PATHS = 96
-# Values of l, and the median distance from the modes, m, from which on the next is tried.
+# Values of l, and the median distance from the modes above which the next value is tried, m.
 LIVELIER, ASTRAY = (1.0, 4.0, 16.0, 64.0), 0.05
-# Distance from which on the modes of an image are taken for wrong, m, and looks at that.
+# Distance above which the modes of an image are taken for wrong, m, and number of such passes.
 WRONG, WRONG_PASSES = 0.15, 3
-# Distance from all motions from which on a mode is a stray, m.
+# Distance from all motions above which a mode is a stray, m.
 STRAY = 0.05
-# Least weight of a motion of more than one image, and of one whose resting feet are held.
+# Minimum weight of a motion of several images, and of one whose resting points are fixed.
 LEAST, LEAST_HELD = 0.03, 0.1
 
 
 class ImageModes(NamedTuple):
-    """What a filter says of an image.
+    """The output of a filter for one image.
 
     Attributes:
-        stamp_ns: of the image.
+        stamp_ns: stamp of the image, ns.
         link: posterior weights and ancestry of its K modes.
-        mixture: the likelihood of the image, undiscounted; K components. Their weights in it do
-            not count.
-        errors: how its errors last.
+        mixture: the likelihood of the image, undiscounted; K components. Its weights are not used.
+        errors: model of errors that last from image to image.
     """
 
     stamp_ns: int
@@ -79,11 +78,11 @@ class WindowImage(NamedTuple):
     """An image of a window.
 
     Attributes:
-        modes: of the image.
-        counted: the likelihood with the covariances that count for changes.
-        points: (K, P, 3) of the modes, m.
-        lasting: factor on the variance that is left after it, because its errors last.
-        alone: factor on the covariances of modes that nothing but the images so far tells of.
+        modes: the modes of the image.
+        counted: the likelihood with covariances for changes between images.
+        points: (K, P, 3) points of the modes, m.
+        lasting: factor on the posterior variance, because the image's errors last.
+        alone: factor on the covariances of modes that belong to no motion.
     """
 
     modes: ImageModes
@@ -94,10 +93,10 @@ class WindowImage(NamedTuple):
 
 
 class FirstStates(NamedTuple):
-    """What the past tells of the first states of M motions of a window.
+    """Gaussian prediction of the first states of M motions of a window.
 
     Attributes:
-        means, covariances: (M, n) and (M, n, n).
+        means, covariances: (M, n) and (M, n, n) of the states.
         liveliness: (M,) l of the motion that each continues.
     """
 
@@ -107,12 +106,12 @@ class FirstStates(NamedTuple):
 
 
 class Past(NamedTuple):
-    """What is known of the first image of a window from the images before.
+    """Prediction of the first image of a window from the images before.
 
     Attributes:
         shares: (K, M) probability that each mode of the image continues each of M motions.
         first: states that these motions predict.
-        places: (M, P, 3) where they were in the last image, m.
+        places: (M, P, 3) points of the motions in the last image, m.
     """
 
     shares: Array
@@ -121,10 +120,10 @@ class Past(NamedTuple):
 
 
 class ChainPrior(NamedTuple):
-    """What states are before images speak, for the core.
+    """Prior of the states, for the core.
 
     Attributes:
-        before, after, forth, which: of `Couplings`.
+        before, after, forth, which: fields of `Couplings`.
         shares: (T-1,) 1 / l.
         known: (n, n) P_1.
         pull: (n,) P_1 m_1.
@@ -144,10 +143,10 @@ class MotionStates(NamedTuple):
 
     Attributes:
         states: (T, n).
-        factor: of their precision.
-        log_joint: log p(X, R), images as Gaussians.
+        factor: factor of their precision.
+        log_joint: log p(X, R), with Gaussian images.
         liveliness: l.
-        trust: (T,) share that each image counts with.
+        trust: (T,) factor on the precision of each image.
         fresh: whether the motion begins without the past.
     """
 
@@ -163,12 +162,12 @@ class SmoothedMotions(NamedTuple):
     """The motions of a window.
 
     Attributes:
-        trajectories: M of them.
-        shares: T arrays (K_t, M), probability that each mode belongs to each motion.
-        evidence: of the images; wrong ones have larger covariances.
+        trajectories: the M trajectories.
+        shares: T arrays (K_t, M), probabilities that each mode belongs to each motion.
+        evidence: evidence of the images; wrong images have larger covariances.
         liveliness: (M,) l.
         fresh: (M,) whether a motion begins without the past.
-        first: of the past; None: nothing is known.
+        first: prediction from the past; None: no past.
     """
 
     trajectories: TrajectoryMixture
@@ -184,16 +183,16 @@ class MotionSmoother:
     """Smooths the modes of a filter's chain.
 
     Attributes:
-        dynamics: of the state.
+        dynamics: dynamics of the state.
         lower, upper: (d,) limits of the pose at every time; None: none.
-        points: maps poses (N, d) to points (N, P, 3), m, by which motions are told apart; None: the
-            variables of the pose.
-        max_motions: motions at most.
+        points: maps poses (N, d) to points (N, P, 3), m, that separate motions; None: the variables
+            of the pose.
+        max_motions: maximum number of motions.
         resting: points that may rest on the ground; None: not used.
-        seed: of the paths that are drawn.
+        seed: random seed of the drawn paths.
 
     Raises:
-        ValueError: settings out of range.
+        ValueError: a setting is out of range.
     """
 
     dynamics: LinearGaussianDynamics
@@ -222,14 +221,14 @@ class MotionSmoother:
         return np.asarray(found.reshape(*poses.shape[:-1], *found.shape[1:]))
 
     def image(self, modes: ImageModes, before_ns: int | None) -> WindowImage:
-        """An image of a window after one at `before_ns`; None: the first.
+        """Prepare an image of a window that follows one at `before_ns`; None for the first.
 
         Raises:
-            ValueError: modes that can not be smoothed, a stamp that does not increase.
+            ValueError: the modes can not be smoothed, or the stamp does not increase.
         """
         if before_ns is not None and modes.stamp_ns <= before_ns:
             raise ValueError(
-                f'stamps must increase, saw {modes.stamp_ns} ns after {before_ns} ns; begin anew '
+                f'stamps must increase, saw {modes.stamp_ns} ns after {before_ns} ns; begin again '
                 'to go back'
             )
         mixture, link = modes.mixture, modes.link
@@ -259,7 +258,7 @@ class MotionSmoother:
         """The motions of a whole sequence.
 
         Raises:
-            ValueError: no images, stamps that do not increase, modes that can not be smoothed.
+            ValueError: no images, a stamp does not increase, or modes can not be smoothed.
         """
         if not sequence:
             raise ValueError('no images to smooth')
@@ -319,7 +318,7 @@ class MotionSmoother:
     def _with_weights_in_time(
         self, found: TrajectoryMixture, images: Sequence[WindowImage], shares: Sequence[Array]
     ) -> TrajectoryMixture:
-        """The trajectories with the weights of the modes that each is nearest to, at each time."""
+        """Give trajectories weights at each time: those of the modes nearest to each."""
         smoothed = backward_weights([image.modes.link for image in images])
         every = self.points_of(found.means).swapaxes(0, 1)
         weights, strays = np.zeros((found.times, len(found))), []
@@ -335,7 +334,7 @@ class MotionSmoother:
         return replace(found, weights_in_time=weights, strays=tuple(strays))
 
     def _first(self, past: Past, nodes: Index, weights: Array, labels: Index) -> FirstStates:
-        """The first state of each motion, by its paths there."""
+        """Predict the first state of each motion, averaged over its paths."""
         shares = np.zeros((int(labels.max()) + 1, past.shares.shape[1]))
         np.add.at(shares, labels, weights[:, None] * past.shares[nodes])
         shares /= shares.sum(1, keepdims=True)
@@ -354,7 +353,7 @@ class MotionSmoother:
         m: int,
         held: bool,
     ) -> MotionStates:
-        """The states of motion m; `held`: points that rest are."""
+        """Compute the states of motion m; `held` fixes its resting points."""
         dynamics, d = self.dynamics, self.dynamics.dimension
         means, precisions = evidence.means[m], inverse(evidence.covariances[m])
         places, trust = self.points_of(means), np.ones(len(means))
@@ -388,7 +387,7 @@ class MotionSmoother:
         seen += 0.5 * product(at, pull_of_first) + couplings.constant(noise)
         gained = 0.5 * (product(states[0], pull_of_first) + (states[:, :d] * pull).sum())
         if held and self.resting is not None and len(states) > 1:
-            # Covariances ignore what rests: rest is a decision, the same from image to image.
+            # Covariances ignore resting points: rest is a decision, the same from image to image.
             poses = np.clip(states, *self.limits())[:, :d]
             resting = self.resting.along(poses, evidence.covariances[m], intervals)
             if resting is not None:
@@ -401,12 +400,12 @@ class MotionSmoother:
         return np.asarray(mean_distances(self.points_of(poses), places))
 
     def advanced(self, found: SmoothedMotions, count: int, after: ImageModes) -> Past:
-        """What the first images of a window tell of the one after them.
+        """Predict the image after the first images of a window.
 
         Args:
-            found: motions of the window.
-            count: images that are left behind.
-            after: the image after these.
+            found: the motions of the window.
+            count: number of images that leave the window.
+            after: the image that follows these.
         """
         dynamics, evidence = self.dynamics, found.evidence
         d = dynamics.dimension
@@ -443,7 +442,7 @@ class MotionSmoother:
 
 
 def _shares(nodes: Index, weights: Array, labels: Index, count: int, masses: Array) -> Array:
-    """Probability (K, M) that each mode of an image belongs to each motion; unvisited: as any."""
+    """Return the probability (K, M) that each mode of an image belongs to each motion."""
     result = np.zeros((count, len(masses)))
     np.add.at(result, (nodes, labels), weights)
     result[~result.any(1)] = masses
@@ -453,13 +452,13 @@ def _shares(nodes: Index, weights: Array, labels: Index, count: int, masses: Arr
 def _conditioned(
     prior: ChainPrior, precisions: Array, means: Array, resting: RestingTable | None = None
 ) -> tuple[Array, BlockCholesky]:
-    """States (T, n) given Gaussians over poses, and the factor of their precision.
+    """Return states (T, n) given Gaussians over poses, and the factor of their precision.
 
     Args:
-        precisions, means: (T, d, d) and (T, d) of the Gaussians.
+        precisions, means: (T, d, d) and (T, d) of the Gaussians over poses.
 
     Raises:
-        NotPositiveDefiniteError: the precision of the states is not.
+        NotPositiveDefiniteError: the precision of the states is not positive definite.
     """
     (times, d), n = means.shape, len(prior.pull)
     columns, states = np.empty((times * n, 2 * n)), np.empty((times, n))

@@ -1,9 +1,9 @@
 """Smoothing while observations arrive: a window of fixed lag.
 
-The window holds the newest images. What the images before tell of its first one is kept as a state
-for each motion (`Past`), so that a new image costs the same however long the sequence is. A pose is
-final before it is older than the newest one by more than the lag, and the time between two
-smoothings.
+The window contains the newest images. The evidence of the images before it is kept as a state for
+each motion (`Past`), so that the cost per image does not depend on the length of the sequence. A
+pose becomes final before its age relative to the newest pose exceeds the lag plus the time between
+two smoothings.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from hmt_ros.smoothing.motion_smoother import (
 from hmt_ros.smoothing.motions import SAME_MOTION, SECOND_NS
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 
-# Intervals between poses vary by this share of their length.
+# Relative variation of the intervals between poses.
 TREMBLE = 0.1
 
 
@@ -39,7 +39,7 @@ class FinalPose:
 
     Attributes:
         stamp_ns: its time.
-        trajectories: of the window, M.
+        trajectories: the M trajectories of the window.
         t: its index in the window.
     """
 
@@ -49,12 +49,12 @@ class FinalPose:
 
     @cached_property
     def mixture(self) -> GaussianMixture:
-        """Its density, K components: one for each trajectory of the window, then the strays."""
+        """Density of the pose, K components: one for each trajectory, then the strays."""
         return self.trajectories.marginal(self.t)
 
     @property
     def velocities(self) -> Array | None:
-        """(K, d) per second; of strays 0. None: unknown."""
+        """Velocities (K, d) per second, 0 for strays; None if unknown."""
         velocities = self.trajectories.velocities
         if velocities is None:
             return None
@@ -64,7 +64,7 @@ class FinalPose:
 
     @property
     def identities(self) -> tuple[int, ...]:
-        """(K,) of the trajectories; of strays 0."""
+        """Identities (K,) of the trajectories; 0 for strays."""
         own = self.trajectories.identities
         return own + (0,) * (len(self.mixture) - len(own))
 
@@ -89,17 +89,16 @@ class SlidingWindow:
     the same numbers.
 
     Args:
-        fixed_lag: time by which a pose is older than the newest one at most when it is final, s:
-            the next one, expected after the same interval as the last, would make it older.
-            0 is filtering; infinite: nothing is final before the end.
-        every: least time between two smoothings, s; poses that become final meanwhile wait for
-            the next.
+        fixed_lag: maximum age of a pose relative to the newest one when it becomes final, s; it
+            becomes final if the next image, expected after the same interval, would exceed this. 0
+            is filtering; infinite: nothing is final before the end.
+        every: minimum time between two smoothings, s; poses become final only in a smoothing.
 
     Attributes:
-        next_identity: number that no motion has had.
+        next_identity: next unused identity.
 
     Raises:
-        ValueError: a lag that is negative or not a number.
+        ValueError: the lag is negative or not a number.
     """
 
     def __init__(
@@ -117,13 +116,13 @@ class SlidingWindow:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets everything; the next image is the first."""
+        """Clear the window; the next image is the first."""
         self.next_identity = self.first_identity
         self._images: list[WindowImage] = []
         self._past: Past | None = None
         self._found: SmoothedMotions | None = None
         self._last: TrajectoryMixture | None = None
-        # Images of the window, the oldest, that are final already.
+        # Number of oldest images of the window that are final.
         self._final = 0
 
     @property
@@ -137,11 +136,11 @@ class SlidingWindow:
         return tuple(image.modes.link for image in self._images)
 
     def step(self, modes: ImageModes) -> WindowUpdate:
-        """Takes the modes of the next image.
+        """Add the modes of the next image.
 
         Raises:
-            ValueError: modes that can not be smoothed, or a stamp that does not increase; the
-                window is as it was.
+            ValueError: the modes can not be smoothed, or the stamp does not increase; the window is
+                unchanged.
         """
         stamp, stamps = int(modes.stamp_ns), self.stamps_ns
         image = self.smoother.image(modes, stamps[-1] if stamps else None)
@@ -163,7 +162,7 @@ class SlidingWindow:
         return WindowUpdate(found, _final_poses(found, range(self._final)))
 
     def _leave_behind(self, newest: WindowImage) -> None:
-        """Takes the images that are final out, before the newest comes."""
+        """Remove final images from the window before the newest one is added."""
         if self._final:
             assert self._found is not None
             after = [*self._images, newest][self._final].modes
@@ -179,7 +178,7 @@ class SlidingWindow:
         return since >= self.every - TREMBLE * interval
 
     def _number_of_final(self) -> int:
-        """How many poses of the window, the oldest, are not to be revised."""
+        """Return the number of oldest poses of the window that are final."""
         stamps = self.stamps_ns
         if self.fixed_lag == math.inf:
             return 0
@@ -188,13 +187,13 @@ class SlidingWindow:
             return len(stamps)
         if len(stamps) < 2:
             return 0
-        # Until the next pose comes they would grow too old; stamps tremble.
+        # Poses that would be too old at the next image; the margin allows for jitter of stamps.
         interval = stamps[-1] - stamps[-2]
         until = stamps[-1] + interval - lag - round(TREMBLE * interval)
         return sum(stamp < until for stamp in stamps[:-1])
 
     def finish(self) -> tuple[FinalPose, ...]:
-        """The poses that are still open, as final as they will be, and forgets everything."""
+        """Return the remaining poses as final ones, and clear the window."""
         last, stamps = self._last, self.stamps_ns
         if last is None or last.stamps_ns is None:
             return ()
@@ -212,11 +211,11 @@ class SlidingWindow:
         return replace(found, identities=self._identities(found))
 
     def _identities(self, found: TrajectoryMixture) -> tuple[int, ...]:
-        """Identities of trajectories, given heaviest first; each has that of its predecessor.
+        """Return identities of trajectories, inherited from predecessors, heaviest first.
 
-        The predecessor is the nearest trajectory of the window before without a heavier successor,
-        distances counted by its weight, if it is closer than `SAME_MOTION`; without one it is a new
-        motion.
+        The predecessor is the trajectory of the last smoothing, closer than `SAME_MOTION` and
+        without a heavier successor, that has the least distance over its weight. Without one, the
+        motion is new.
         """
         numbers = np.zeros(len(found), dtype=np.int64)
         away, before = self._distances(found)
@@ -231,10 +230,10 @@ class SlidingWindow:
         return tuple(int(number) for number in numbers)
 
     def _distances(self, found: TrajectoryMixture) -> tuple[Array, tuple[int, ...]]:
-        """Distances (M, L) from the L trajectories found last, and their identities.
+        """Return distances (M, L) from the last L trajectories, and their identities.
 
-        They are means over the points, and over the times of both windows, over the weight of the
-        one found last; infinite beyond `SAME_MOTION`.
+        They are means over the points and the common times, divided by the weight of the last
+        trajectory; infinite beyond `SAME_MOTION`.
         """
         last = self._last
         common = 0 if last is None else len({*self.stamps_ns} & {*(last.stamps_ns or ())})

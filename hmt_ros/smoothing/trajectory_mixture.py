@@ -4,7 +4,7 @@
 
 Every component is a Gaussian Markov process with block-tridiagonal precision P_i, so that
 densities, samples and marginals cost O(T) and no (T d, T d) covariance exists. Where the state has
-velocities, they are integrated out of everything that is returned.
+velocities, they are integrated out of all results.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ class TrajectoryMixture:
         inflation: (M,) s_i, factor on standard deviations.
         log_joint: (M,) log p(M_i, R) at the means.
         free_energy: (I,) per iteration, nats, on the samples of the descent.
-        dimension: d.
-        stamps_ns: (T,) times; None: not known.
+        dimension: d, number of variables of a pose.
+        stamps_ns: (T,) times, ns; None: unknown.
         final_until_ns: poses at or before this time will not be revised.
-        identities: (M,) numbers, from 1 on, that motions keep from window to window; empty: there
-            is one window, and trajectories have no identity.
-        free_energy_fresh: on samples that the descent has not seen, and its standard error.
-        lower, upper: (d,) limits; samples beyond them are projected onto them.
-        disagreements: (M, T, d, d) of the modes that motions stand for, beside the density of the
-            trajectories: part of marginals alone. None: components are no motions.
-        weights_in_time: (T, M) probability of the modes that each motion is near, at each time;
-            None: the weights.
-        strays: T mixtures of modes that no motion is near, with their probabilities: part of
-            marginals, whose last components they are. Empty: there are none.
+        identities: (M,) numbers from 1, constant over windows for each motion; empty for a single
+            window, whose trajectories have no identity.
+        free_energy_fresh: free energy on samples not used in the descent, and its standard error.
+        lower, upper: (d,) limits; samples are clipped to them.
+        disagreements: (M, T, d, d) covariance between the modes of each motion; it is added to the
+            marginals only. None: components are not motions.
+        weights_in_time: (T, M) total probability of the modes near each motion at each time; None:
+            the weights.
+        strays: T mixtures of modes far from all motions, with their probabilities; they are the
+            last components of the marginals. Empty if there are none.
 
     Raises:
-        ValueError: shapes that contradict each other, weights that do not sum to 1.
+        ValueError: shapes are inconsistent, or weights do not sum to 1.
     """
 
     weights: Array
@@ -94,7 +94,7 @@ class TrajectoryMixture:
 
     @property
     def times(self) -> int:
-        """T."""
+        """Number of times, T."""
         return int(self.states.shape[1])
 
     @property
@@ -118,8 +118,8 @@ class TrajectoryMixture:
     def velocities(self) -> Array | None:
         """Velocities of the poses, (M, T, d) per second; None: unknown.
 
-        They are those of the states or, where a state is a pose alone, differences: of both
-        neighbours, at the ends of the one that there is.
+        They are those of the states or, if the state is only a pose, central differences, one-sided
+        at the ends.
         """
         if self.states.shape[2] == 2 * self.dimension:
             return self.states[:, :, self.dimension :]
@@ -131,8 +131,8 @@ class TrajectoryMixture:
     def marginal(self, t: int) -> GaussianMixture:
         """The density of the pose at index t: a component for each trajectory, and the strays.
 
-        Of motions the heaviest leads at every time, see `led_by_first`: what outweighs it for an
-        image is flicker.
+        For motions, the heaviest one has the largest weight at every time; see `led_by_first`.
+        Another motion that is heavier in a single image is flicker.
         """
         covariances = np.array([self.covariances_of(i, t + 1)[t] for i in range(len(self))])
         weights = self.weights if self.weights_in_time is None else self.weights_in_time[t]
@@ -200,7 +200,7 @@ class TrajectoryMixture:
         """Content of a message besides names and frame (`msg_tools.messages`).
 
         Args:
-            covariances: whether they are part of it; else they are not computed.
+            covariances: whether to compute and include covariances.
 
         Raises:
             ValueError: the stamps are not known.
@@ -222,7 +222,7 @@ class TrajectoryMixture:
 
 
 def joined(one: GaussianMixture, other: GaussianMixture) -> GaussianMixture:
-    """The components of both."""
+    """Concatenate the components of two mixtures."""
     return GaussianMixture(
         np.concatenate([one.weights, other.weights]),
         np.concatenate([one.means, other.means]),
@@ -231,9 +231,10 @@ def joined(one: GaussianMixture, other: GaussianMixture) -> GaussianMixture:
 
 
 def led_by_first(weights: Array) -> Array:
-    """Weights (K,) that sum to the same, of which none is above the first.
+    """Reduce weights (K,) above the first one, keeping their sum.
 
-    What others weigh above a level goes to the first, which then has that level.
+    The excess of other weights above a level is added to the first weight, which then equals that
+    level.
     """
     heavier = -np.sort(-weights[1:][weights[1:] > weights[0]])
     levels = (weights[0] + np.cumsum(heavier)) / np.arange(2, len(heavier) + 2)

@@ -1,4 +1,4 @@
-"""Trajectories of locally greatest posterior probability (VMS 5, with its numbers).
+"""Trajectories of locally maximal posterior density (VMS 5, equations numbered as there).
 
     E(X) = -log p(x_1) - sum_t log p(x_t | x_{t-1}) - sum_t log p(r_t | x_t)       -log of (1)
 
@@ -6,11 +6,10 @@ is minimised from many starts by damped Newton steps D on the block-tridiagonal 
 
     minimise    g.D + 1/2 D.(H + lambda W) D    subject to    lower <= x_t <= upper       (5)
 
-where `TrustRegion` moves lambda. The Hessian of an observation is indefinite between modes: where
-the matrix can not be factorised, the step is made with a share of the positive part of the
-curvature, and where that does not descend either, the damping grows. Variables that rest on a limit
-with a gradient that pushes them outwards are held there; a step that crosses limits is projected
-onto the box.
+where `TrustRegion` adapts lambda. The Hessian of an observation is indefinite between modes. If the
+matrix can not be factorised, the step uses a blend with the positive part of the curvature; if that
+does not descend either, the damping grows. Variables at a limit whose gradient pushes them outwards
+are fixed there; a step that crosses limits is projected onto the box.
 """
 
 from __future__ import annotations
@@ -34,9 +33,9 @@ from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
 FIRST_DAMPING = 1e-4
 DAMPING_LIMIT = 1e10
-# Shares of the positive Hessian in a step, where the exact one is indefinite.
+# Shares of the positive Hessian in a step where the exact Hessian is indefinite.
 SHARES = (0.125, 0.25, 0.5, 0.75)
-# Doubles in the Hessians of the observations that are held at once.
+# Maximum number of doubles in the observation Hessians in memory.
 HESSIAN_BUDGET = 800_000
 
 
@@ -46,15 +45,15 @@ class RefinedTrajectories:
 
     Attributes:
         states: (M, T, n).
-        energies: (M,) E, nats.
-        observation_energies: (M,) the part of the observations, - sum log p(r_t | x_t).
-        free: (M, T, n) variables that do not rest on a limit.
+        energies: (M,) energies E, nats.
+        observation_energies: (M,) the part of the observations, - sum log p(r_t | x_t), nats.
+        free: (M, T, n) whether a variable is not fixed at a limit.
         status: (M,) of `Status`.
-        iterations: (M,) evaluations after the first.
-        factors: M Cholesky factors of the precision there. For a variable that rests on a limit
-            it is that of the slope: the density falls off as exp(-g distance), which has variance
-            1 / g^2.
-        starts: (M,) which start each of them came from.
+        iterations: (M,) number of evaluations after the first.
+        factors: M Cholesky factors of the precision at the optimum. A variable at a limit gets the
+            precision of its slope: the density falls off as exp(-g distance), which has variance 1
+            / g^2.
+        starts: (M,) index of the start of each optimum.
     """
 
     states: Array
@@ -70,7 +69,7 @@ class RefinedTrajectories:
         return len(self.energies)
 
     def __getitem__(self, index: Index) -> RefinedTrajectories:
-        """Some of them, in the order of the index."""
+        """Select optima, in the order of the index."""
         return RefinedTrajectories(
             self.states[index],
             self.energies[index],
@@ -83,10 +82,10 @@ class RefinedTrajectories:
         )
 
     def without_duplicates(self, distance: float = 0.1) -> RefinedTrajectories:
-        """Distinct optima, the most probable first.
+        """Return distinct optima, the most probable first.
 
-        Two optima are the same when their energies and their states, in standard deviations of the
-        more probable one, differ by less than a distance.
+        Two optima are the same if their energies, nats, and their states, in standard deviations of
+        the more probable one, differ by less than a distance.
         """
         order = np.argsort(self.energies, kind='stable')
         kept: list[int] = []
@@ -114,15 +113,15 @@ def refine(
     max_iterations: int = 60,
     tolerance: float = 1e-6,
 ) -> RefinedTrajectories:
-    """Minimises the energy from M starts (M, T, n).
+    """Minimise the energy from M starts.
 
     Args:
-        starts: projected onto the box.
-        prior: of the states.
-        likelihood: of the first d variables of each state.
+        starts: (M, T, n) initial trajectories; they are projected onto the box.
+        prior: prior of the states.
+        likelihood: likelihood of the first d variables of each state.
         lower, upper: (d,) limits at every time, or scalars.
-        max_iterations: evaluations per trajectory after the first one.
-        tolerance: converged when a step is predicted to gain less than this, nats.
+        max_iterations: maximum number of evaluations per trajectory after the first one.
+        tolerance: predicted gain of a step below which a trajectory has converged, nats.
     """
     starts = np.asarray(starts, dtype=np.float64)
     _, times, n = starts.shape
@@ -145,7 +144,7 @@ def refine(
 
 
 class _Problem:
-    """The minimisation of some trajectories at once: where they are, and how each one steps."""
+    """The joint minimisation of several trajectories: their states and step controls."""
 
     def __init__(
         self,
@@ -172,7 +171,7 @@ class _Problem:
         self.status[~np.isfinite(self.energy)] = Status.NOT_FINITE
 
     def minimise(self, max_iterations: int, tolerance: float) -> None:
-        """Steps until every trajectory has converged, or may not go on."""
+        """Iterate until every trajectory has converged, stalled or used its iterations."""
         active = np.flatnonzero(self.status == Status.ITERATION_LIMIT)
         for _ in range(max_iterations + 1):
             step, predicted = self._steps(active)
@@ -191,7 +190,7 @@ class _Problem:
             self.states[rows] = trial[better]
             for name, value in zip(('energy', 'observed', 'gradient', 'hessian'), found):
                 getattr(self, name)[rows] = value[better]
-            # The positive part of the curvature first, damping after that.
+            # First use the positive part of the curvature, then increase the damping.
             refused = active[~better]
             damped = refused[~self.exact[refused]]
             self.exact[rows], self.exact[refused] = True, False
@@ -199,7 +198,7 @@ class _Problem:
             active = active[self.status[active] == Status.ITERATION_LIMIT]
 
     def result(self, offset: int) -> RefinedTrajectories:
-        """The optima; `offset` is the index of the first start."""
+        """Return the optima; `offset` is the index of the first start."""
         everyone = np.arange(len(self.states))
         held = resting(self.states, self.gradient, self.low, self.high)
         # The density beyond a limit is zero and falls off inside as exp(-g distance).
@@ -224,7 +223,7 @@ class _Problem:
     def _evaluate(
         self, states: Array, derivatives: Derivatives
     ) -> tuple[Array, Array, Array, Array]:
-        """Energy, that of the observations, gradient (M, T, n), Hessians (M, T, d, d)."""
+        """Return energy, observation energy, gradient (M, T, n) and Hessians (M, T, d, d)."""
         m, d = len(states), self.prior.dimension
         at = np.tile(np.arange(self.times), m)
         poses = states[:, :, :d].reshape(-1, d)
@@ -242,7 +241,7 @@ class _Problem:
         return energy, observed, gradient, hessian.reshape(m, self.times, d, d)
 
     def _steps(self, active: Index) -> tuple[Array, Array]:
-        """Damped steps (M, T, n), projected onto the box, and the decrease that is predicted."""
+        """Return damped steps (M, T, n), projected onto the box, and their predicted decreases."""
         step = np.zeros((len(active), self.times, self.size))
         predicted = np.zeros(len(active))
         held = resting(self.states[active], self.gradient[active], self.low, self.high)
@@ -254,7 +253,8 @@ class _Problem:
             positive = self._evaluate(self.states[active[failed]], Derivatives.POSITIVE)[3]
             for row, hessian in zip(failed, positive):
                 i = active[row]
-                # Indefinite: the least share of the positive Hessian that mends this.
+                # Indefinite: use the least share of the positive Hessian that makes it positive
+                # definite.
                 if self.exact[i] and any(
                     self._step(
                         i,
@@ -279,7 +279,7 @@ class _Problem:
         return step, predicted
 
     def _step(self, i: int, hessian: Array, held: NDArray[np.bool_], step: Array) -> bool:
-        """Writes the step of a trajectory; False where the matrix is not positive definite."""
+        """Compute the step of a trajectory; return False if the matrix is not positive definite."""
         extra = self.region.damping[i] * self._metric(hessian)
         factor = self._factor(hessian, extra, held)
         if factor is None:
@@ -289,7 +289,7 @@ class _Problem:
         return True
 
     def _metric(self, hessian: Array) -> Array:
-        """Diagonal (T, n) in which steps are measured."""
+        """Return the diagonal (T, n) of the metric of steps."""
         d = self.prior.dimension
         metric = np.diagonal(self.prior.precision.diagonal, axis1=1, axis2=2).copy()
         metric[:, :d] += np.maximum(np.diagonal(hessian, axis1=1, axis2=2), 0.0)
@@ -298,7 +298,7 @@ class _Problem:
     def _factor(
         self, hessian: Array, extra: Array, held: NDArray[np.bool_] | None = None
     ) -> BlockCholesky | None:
-        """Factor of the prior's precision + Hessians (T, d, d) + a diagonal (T, n), or None."""
+        """Factorise prior precision + Hessians (T, d, d) + diagonal (T, n); None if indefinite."""
         columns = self.band.copy()
         add_diagonal(columns, np.ascontiguousarray(hessian), self.size)
         columns[:, 0] += extra.reshape(-1)
@@ -310,7 +310,7 @@ class _Problem:
             return None
 
     def _positive_factor(self, hessian: Array, extra: Array) -> BlockCholesky:
-        """As `_factor`, with an addition that makes the matrix positive definite."""
+        """Factorise as `_factor`, with a shift that makes the matrix positive definite."""
         shift = 0.0
         while True:
             factor = self._factor(hessian, extra + shift * self._metric(hessian))
@@ -322,10 +322,10 @@ class _Problem:
 def limits_of_states(
     lower: ArrayLike, upper: ArrayLike, dimension: int, size: int
 ) -> tuple[Array, Array]:
-    """Limits (n,) of the states from those (d,) of the poses; velocities have none.
+    """Extend limits (d,) of the poses to limits (n,) of the states; velocities have none.
 
     Raises:
-        ValueError: limits of another dimension, or a lower one above the upper one.
+        ValueError: limits have the wrong dimension, or a lower limit is above the upper one.
     """
     low, high = np.full((2, size), [[-np.inf], [np.inf]])
     for name, limits, given in (('lower', low, lower), ('upper', high, upper)):

@@ -11,13 +11,13 @@ expectation is over samples
 
     X = M_i + s_i L_i'^-1 z
 
-with the same antithetic noise z throughout, so that the sampled F is a smooth function with exact
-gradients and its descent is repeatable; the F that is reported comes from fresh samples, with a
-standard error. Variables are scaled by the curvature that F would have if the posterior were q:
-means by L_i sqrt(a_i), log s_i by sqrt(2 D a_i).
+with the same antithetic noise z throughout, so that the sampled F is smooth with exact gradients
+and its descent is repeatable; the reported F uses fresh samples and has a standard error. Variables
+are scaled by the curvature that F would have if the posterior were q: means by L_i sqrt(a_i), log
+s_i by sqrt(2 D a_i).
 
-Most components are far from each other, and two that are need not be compared: of the samples of i,
-those that j is responsible for have at most the probability
+Most components are far from each other, and such pairs are skipped: the samples of i that j is
+responsible for have at most the probability
 
     E_i[a_j q_j / (a_i q_i + a_j q_j)] <= (a_j / a_i)^(1/2) / 2 int (q_i q_j)^(1/2)
 
@@ -48,30 +48,30 @@ from hmt_ros.inference.threads import together
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
 ADAPTABLE = ('weights', 'means', 'inflation')
-# Components are split into so many parts, whatever the machine: sums keep their order.
+# Number of parts that components are split into; fixed, so that sums keep their order.
 PARTS = 4
-# Iterations in a row that may pass without a gain on samples that the descent does not see.
+# Maximum number of successive iterations without a gain on held-out samples.
 PATIENCE = 3
-MEMORY = 8  # pairs of steps and gradients
-# Least proportion that scales the variables of a component.
+MEMORY = 8  # number of pairs of steps and gradients
+# Minimum proportion in the scale of a component's variables.
 LEAST_WEIGHT = 1e-4
-# Logarithm of an overlap that makes no difference.
+# Minus the logarithm of a negligible overlap.
 NEGLIGIBLE = 30.0
 
 
 @dataclass(frozen=True, eq=False)
 class VariationalMixture:
-    """A mixture over trajectories of states, and how it was found.
+    """A mixture over trajectories of states, with the trace of its optimisation.
 
     Attributes:
         weights: (M,) a_i.
         states: (M, T, n) M_i.
         inflation: (M,) s_i.
-        free_energy: (I,) at the start and after each iteration, nats, on the samples of the
-            descent.
-        held_out: (J,) the same on the samples that choose the iterate, J >= I, as the descent goes
-            on for a while after the best one; empty where there was no descent.
-        fresh: F on samples that were not used, and its standard error.
+        free_energy: (I,) F at the start and after each iteration, on the samples of the descent,
+            nats.
+        held_out: (J,) the same on the samples that choose the iterate, J >= I, because the descent
+            continues for a while after the best one; empty without a descent.
+        fresh: F on unused samples, and its standard error, nats.
     """
 
     weights: Array
@@ -83,7 +83,7 @@ class VariationalMixture:
 
 
 def laplace_masses(energies: Array, factors: Sequence[BlockCholesky]) -> Array:
-    """log (M,) of the integrals of p(X, R) around optima, as if it were Gaussian there."""
+    """Return logs (M,) of the integrals of p(X, R) around optima, by Laplace's approximation."""
     size = factors[0].times * factors[0].size
     determinants = np.array([factor.log_determinant for factor in factors])
     return np.asarray(-energies - 0.5 * determinants + 0.5 * size * elementary.log(2 * np.pi))
@@ -104,19 +104,19 @@ def minimise_free_energy(
     max_iterations: int = 15,
     tolerance: float = 1e-4,
 ) -> VariationalMixture:
-    """Descends from a mixture of M components with inflation 1.
+    """Minimise F from a mixture of M components with inflation 1.
 
     Args:
         weights: (M,) proportions.
         states: (M, T, n) means.
         adapt: some of `ADAPTABLE`.
         low, high: (n,) limits of the means.
-        samples: per component, an even number.
-        max_iterations: of L-BFGS; 0 evaluates only.
-        tolerance: ends when an iteration gains less, nats.
+        samples: number of samples per component, even.
+        max_iterations: maximum number of L-BFGS iterations; 0 evaluates only.
+        tolerance: gain of an iteration below which the descent ends, nats.
 
     Raises:
-        ValueError: an odd number of samples.
+        ValueError: the number of samples is odd or below 2.
     """
     if samples < 2 or samples % 2:
         raise ValueError(f'samples must be an even number from 2 up, saw {samples}')
@@ -150,16 +150,15 @@ def minimise_free_energy(
 
 
 def antithetic(rng: np.random.Generator, components: int, samples: int, size: int) -> Array:
-    """White noise (M, S, D) in pairs z, -z."""
+    """Draw white noise (M, S, D) in pairs z, -z."""
     half = standard_normals(rng, (components, samples // 2, 1, size))
     return np.concatenate([half, -half], axis=2).reshape(components, samples, size)
 
 
 def matched(noise: Array) -> Array:
-    """Noise (M, S, D) scaled to the variance that it should have, for each component.
+    """Scale noise (M, S, D) to unit variance in each component.
 
-    The variance of the noise is known and need not be estimated: with few samples an inflation
-    would follow their chance variance.
+    With few samples the inflation would otherwise follow the chance variance of the noise.
     """
     return np.asarray(noise / np.sqrt((noise * noise).mean((1, 2), keepdims=True)))
 
@@ -167,15 +166,15 @@ def matched(noise: Array) -> Array:
 def _descend(
     objective: FreeEnergy, choice: Array, max_iterations: int, tolerance: float
 ) -> tuple[Array, Array, Array]:
-    """L-BFGS from 0: the best iterate, the values up to it, and those on samples held out.
+    """Run L-BFGS from 0; return the best iterate, F up to it, and F on held-out samples.
 
-    With few samples the descent ends up fitting their noise. The iterate is kept that has the least
-    F on other samples, and the descent ends when F no longer falls on those.
+    With few samples the descent fits their noise. The iterate with the least F on held-out samples
+    is kept, and the descent ends when F no longer falls on those.
     """
     best = start = np.zeros(objective.parameters)
     first = objective(start)
     trace, held_out = [first[0]], [_free_energy(objective, start, choice)]
-    # Where the descent begins has been evaluated.
+    # The start has already been evaluated.
     iterates = descent(
         lambda x: objective(x) if x.any() else first,
         start,
@@ -353,9 +352,9 @@ class FreeEnergy:
         return value + found.value.reshape(s, self.times).sum(1), gradient
 
     def _near(self, means: Array, inflation: Array) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-        """(M, M) which components may overlap, by their marginals where they are farthest apart.
+        """Return (M, M) whether components may overlap, by marginals at the time they differ most.
 
-        And when that is, (M, M).
+        Also return this time, (M, M).
         """
         near = np.ones((self.count, self.count), dtype=bool)
         metric = self.bands[:, :, 0] ** 2

@@ -3,9 +3,9 @@
     place    share of the model that is foreground / usual share
     area     area of the largest piece of the foreground that has the shape of one person / usual
 
-Where the clothes have the colours of the room only a part of the model is foreground: the share is
+If the clothes have the colours of the room, only a part of the model is foreground, so the share is
 compared with that of earlier images of the track. A person who has not been seen for a time t may
-have gone RUNNING_SPEED t further away; the usual area shrinks accordingly. For colours see
+be RUNNING_SPEED t further away; the usual area shrinks accordingly. For colours see
 `image.person_colours`.
 """
 
@@ -56,7 +56,7 @@ class Silhouetted(NamedTuple):
 
 
 class Appearance:
-    """How one person usually looks.
+    """The usual appearance of one person.
 
     Attributes:
         colours: of the person.
@@ -69,23 +69,23 @@ class Appearance:
         self._share, self._area = MAJORITY, math.nan
         self._stamp = 0
         self._coloured: int | None = None
-        # Foreground of the last image on the raster, and the piece of it that is a person.
+        # Foreground of the last image on the raster, and its largest piece shaped like a person.
         self._foreground: Mask | None = None
         self._piece: Piece | None = None
 
     def open_to_view(self, others: Mask | None) -> float:
-        """Share of the person, where the person was last seen, that others (H, W) do not cover."""
+        """Share of the person, at the last known place, that others (H, W) do not cover."""
         if self._model is None or others is None:
             return 1.0
         hidden = counted(self._model & on_raster(others, self._model))
         return 1.0 - hidden / max(counted(self._model), 1)
 
     def unseen(self, stamp: int) -> float:
-        """Time for which the person has not been seen at a stamp, ns, in s; never seen: 0."""
+        """Time from the last sight of the person to a stamp, ns, in s; 0 if never seen."""
         return 0.0 if self._model is None else seconds(stamp - self._stamp)
 
     def silhouetted(self, view: View, stamp: int) -> Silhouetted | None:
-        """Evidence of an image's silhouette; None: it has none, or most of it has changed.
+        """Evidence of the silhouette; None without one, or if most of the image has changed.
 
         Args:
             view: of the image.
@@ -115,9 +115,9 @@ class Appearance:
         )
 
     def colour_evidence(self, view: View) -> tuple[bool, float] | None:
-        """Whether colours are evidence for somebody, and its weight from 0 to 1; None: neither.
+        """Whether colours speak for or against a person, with a weight of 0 to 1; None if unknown.
 
-        Evidence against somebody has weight 0 in another scene than that of the last learning.
+        Evidence against a person has weight 0 in another scene than that of the last learning.
         """
         image = _coarse(view)
         score = self.colours.score(image)
@@ -132,13 +132,13 @@ class Appearance:
         return False, against * self.colours.stillness(image)
 
     def motion(self, view: View) -> Motion:
-        """What has moved since the image that was learned last; see `Colours.motion`."""
+        """Motion in the image since the last learned one; see `Colours.motion`."""
         return self.colours.motion(_coarse(view))
 
     def is_apart(self, view: View, stamp: int) -> bool:
-        """Whether most keypoints lie beside the box around the model, where a person may have gone.
+        """Whether most keypoints lie outside the box around the model, within the person's reach.
 
-        Keypoints too far away for so short a time are an error of the detector, or another person.
+        Keypoints further away are an error of the detector, or another person.
         """
         keypoints = view.keypoints
         if keypoints is None or self._model is None or not keypoints.seen.any():
@@ -151,7 +151,7 @@ class Appearance:
         return bool(0.25 * max(width, height) < np.median(away) < way)
 
     def learn(self, view: View, stamp: int, body: Body, camera: Camera, pose: Array) -> None:
-        """Learns from an image in which the person is at a pose (d,); `silhouetted` came before."""
+        """Learns from an image with the person at a pose (d,), after a call of `silhouetted`."""
         dt = 0.0 if self._model is None else seconds(stamp - self._stamp)
         gain = -float(elementary.expm1(-dt / MEMORY_TIME))
         self._model = model = covered(body, camera, pose, raster_step(camera.height))

@@ -1,25 +1,26 @@
-"""The start of a track: a table of what may start one, in order; the first that is there decides.
+"""The start of a track: a table of possible sources; the first available one decides.
 
     source        needs                                             sure (nats, beside existence)
     subject       a subject file, and an image at or after it       given
-    mixture       a mixture that was given                          given
+    mixture       a given mixture                                   given
     keypoints     most of the trunk, and 6 joints in all            -
-    prediction    poses that a regression expects by the image      AT_ONCE
+    prediction    poses that a regression predicts                  AT_ONCE
     keypoints     of a part: a person, both shoulders or hips       -
     box           a box around the person                           given
-    mask          one that has the shape of a person                -
+    mask          a mask with the shape of a person                 -
 
 A track starts once
 
     log odds of existence + sure + log p(distance) >= log odds of PRESENT_PROBABILITY
 
-p(distance) is log-normal, wide, and never a limit: people are seen at 0.4 to 15 m by a lens of 60
-degrees, at distances that grow with the focal length. After a track has ended a silhouette before
-a known scene suffices, too.
+p(distance) is log-normal, wide, and never a limit: a lens of 60 degrees sees people at 0.4 to 15 m,
+and the distances grow with the focal length. After a track has ended, a silhouette before a known
+scene suffices, too.
 
 Keypoints give poses, depth and lengths (see `initialisation`); a mask or a box gives mean poses of
-several headings. A detector may take left for right, and silhouettes do not tell sides at all: with
-every pose comes its reversal in depth, and both ways to face are followed (see `classes`).
+several headings. A detector may confuse left and right, and silhouettes do not distinguish sides,
+so the reversal in depth of the poses is a hypothesis too, and both facing directions are tracked
+(see `classes`).
 """
 
 from __future__ import annotations
@@ -61,10 +62,10 @@ from hmt_ros.tracking.initialisation import (
 from hmt_ros.tracking.observer import View
 from hmt_ros.tracking.settings import MAX_STARTS, PRESENT_PROBABILITY, SAME_MOMENT
 
-# What a prediction is sure of by itself, nats: in the first image nothing else has spoken.
+# Log odds of existence by a prediction itself, nats: a first image may have no other evidence.
 AT_ONCE = 1.5 * CLEAR.nats
 PRESENT_LOG_ODDS = float(elementary.log(PRESENT_PROBABILITY / (1.0 - PRESENT_PROBABILITY)))
-# Share of the best poses from keypoints whose reversals in depth are searched, too.
+# Maximum number of best poses from keypoints whose reversals in depth are added.
 REVERSED = MAX_STARTS // 4
 
 
@@ -80,14 +81,14 @@ class Source(Enum):
     ARRIVAL = 'who has come into view'
 
 
-# Starts whose best pose is near that of the person; those that silhouettes alone may have led to.
+# Starts with a best pose near the person's, and starts that may rest on silhouettes alone.
 FROM_JOINTS = (Source.SUBJECT, Source.KEYPOINTS)
 FROM_SILHOUETTES = (Source.PREDICTION, Source.ARRIVAL)
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """An image, and what was given before it.
+    """An image, and the start that the user gave.
 
     Attributes:
         view: of the image.
@@ -109,7 +110,7 @@ class Shown:
 
     @property
     def depths(self) -> ImageMap | None:
-        """Of the image; None: unknown."""
+        """Depths of the image; None if unknown."""
         return depths_of(self.view.depth)
 
 
@@ -157,7 +158,7 @@ def _from_box(shown: Shown) -> Start:
 
 
 def _at_depth(shown: Shown, body: Body, mixture: GaussianMixture) -> Start:
-    """A mixture over poses, moved to where a depth image shows their trunks."""
+    """A start from a mixture over poses, moved to the depths of their trunks if measured."""
     means = moved_to_depth(body, shown.camera, mixture.means, shown.depths)
     return Start(body, means, replace(mixture, means=means))
 
@@ -178,8 +179,8 @@ def _masked(shown: Shown) -> bool:
     return mask is not None and silhouette is not None and looks_like_person(silhouette)
 
 
-# The source; whether an image has what it takes; how sure it is that somebody is there, beside the
-# evidence for existence, nats; and what makes the start, None if the image does not show it.
+# Source; test of the required inputs; `sure`, the log odds of existence by the source itself, nats,
+# infinite for a given start; function that makes the start, or None if the image does not allow it.
 STARTS: tuple[
     tuple[Source, Callable[[Shown], bool], float, Callable[[Shown], Start | None]], ...
 ] = (
@@ -206,7 +207,7 @@ STARTS: tuple[
 
 
 def first_start(shown: Shown, existence: Existence) -> tuple[Source, Start] | None:
-    """The start of the track at an image, and its source; None: it does not start there."""
+    """The source and the start of a track at an image; None if no track starts."""
     awaited = shown.given is not None and shown.box is None
     usable = (
         (source, sure, begin)
@@ -230,7 +231,7 @@ def first_start(shown: Shown, existence: Existence) -> tuple[Source, Start] | No
 
 
 def lifted_poses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
-    """Poses (N, d) of a person from the depths of keypoints by experts, if there are any."""
+    """Poses (N, d) of a person from keypoints lifted by experts; none without experts."""
     lifted = keypoints.lifted
     if lifted is None or not lifted.are_whole:
         return np.empty((0, body.dimension))
@@ -246,10 +247,10 @@ def poses_to_search(
     prediction: PosePrediction | None,
     upright: Gravity | None,
 ) -> Array | None:
-    """Poses (N, d) of a person from an image alone; None: it shows none.
+    """Poses (N, d) of a person from an image alone; None if it gives none.
 
-    The body keeps its lengths and flesh. From keypoints come all poses that explain them, from
-    a silhouette mean poses of several headings at its place, and predicted poses.
+    The body keeps its lengths and flesh. Keypoints give all poses that explain them; without them
+    a silhouette gives mean poses of several headings at its place. Predicted poses are added.
     """
     found = []
     keypoints, depths = observation.keypoints, observation.evidence.get(DEPTH.name)
@@ -268,7 +269,7 @@ def poses_to_search(
 def with_reversals(body: Body, poses: Array) -> Array:
     """Poses (N, d), best first, and the reversals in depth of the best.
 
-    A reversal explains the same keypoints if the detector has taken left for right.
+    A reversal explains the same keypoints if the detector has exchanged left and right.
     """
     if not body.trunk_pairs:
         return poses

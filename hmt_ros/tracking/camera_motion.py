@@ -1,10 +1,10 @@
-"""Motion of the camera between images, in a frame that stands still.
+"""Motion of the camera between images, in a fixed frame.
 
-    p' = R p + t                     of a point that stands still, in the frames of two images, m
+    p' = R p + t                     of a fixed point, in the camera frames of two images, m
     R = C'^T C,  t = C'^T (c - c')   with poses of the camera p_fixed = C p + c
 
-A mixture over poses lives in the camera frame. Before it is predicted it is carried from the frame
-of the last image into that of the present one, so that velocities and predictions are those of the
+A mixture over poses is in the camera frame. Before prediction it is transformed from the frame of
+the last image to that of the present one, so that velocities and predictions are those of the
 person in the fixed frame. With the rotation vectors of the root's angles, w = A(a) da/dt,
 
     place' = R place + t,   Q(a') = R Q(a),   da' = A(a')^-1 R A(a) da
@@ -31,7 +31,7 @@ from hmt_ros.tracking.settings import MAX_EXTRAPOLATION_TIME
 
 @dataclass(frozen=True, eq=False)
 class CameraMotion:
-    """From the camera frame of one image into that of another: p' = R p + t.
+    """Transform from the camera frame of one image to that of another: p' = R p + t.
 
     Attributes:
         rotation: R (3, 3).
@@ -43,18 +43,18 @@ class CameraMotion:
 
     @classmethod
     def between(cls, before: CameraPose, now: CameraPose) -> CameraMotion | None:
-        """The motion from one pose of the camera to another; None: they are the same."""
+        """The motion from one pose of the camera to another; None if they are the same."""
         if before.equals(now):
             return None
         back = now.rotation.T
         return cls(product(back, before.rotation), product(back, before.position - now.position))
 
     def points(self, points: Array) -> Array:
-        """Points (..., 3) that stand still, m."""
+        """Transforms fixed points (..., 3), m."""
         return self.directions(points) + self.translation
 
     def directions(self, directions: Array) -> Array:
-        """Directions (..., 3) that stand still."""
+        """Transforms fixed directions (..., 3)."""
         result: Array = product(directions, self.rotation.T)
         return result
 
@@ -65,14 +65,14 @@ class CameraMotion:
     def free_poses(
         self, body: Body, poses: Array, turn: float = 0.0, to: Body | None = None
     ) -> Array:
-        """Poses (N, d) of a body in the new frame, which need not be before a camera.
+        """Poses (N, d) of a body in the new frame, without regard to its limits.
 
         Args:
             body: of the poses.
             poses: (N, d).
-            turn: angle about z by which the root has turned, up to whole turns, rad: where it was
-                followed over several motions.
-            to: the same body with the level of the result; None: the level stays.
+            turn: angle about z by which the root has turned, rad, to choose the whole turns where
+                several motions are chained.
+            to: the same body with the level of the result; None: the level is unchanged.
         """
         offset = body.skeleton.offsets[0]
         result = turned(body, poses, body if to is None else to, self.rotation, turn)
@@ -86,7 +86,7 @@ class CameraMotion:
         return result
 
     def modes(self, body: Body, modes: Modes) -> Modes:
-        """Modes in the new camera frame: poses, velocities, covariances, soles and ways to face."""
+        """Modes in the new camera frame."""
         poses = self.poses(body, modes.poses)
         jacobians = self.jacobians(body, modes.poses, poses)
         joints = body.joint_positions(poses)
@@ -111,13 +111,12 @@ class CameraMotion:
 class CameraPath:
     """The poses of the camera at the images, given for most of them.
 
-    Where an image has none, the camera is taken to go on as between the last two poses that were
-    given, for `MAX_EXTRAPOLATION_TIME` at most; after that its motion is unknown until the next one
-    is given. A guess does not count against a later pose: the pose at the image before is then
-    interpolated.
+    For an image without a pose, the motion between the last two given poses is extrapolated, for at
+    most `MAX_EXTRAPOLATION_TIME`; after that it is unknown until the next pose is given. A later
+    pose replaces the extrapolation: the pose at the previous image is then interpolated.
 
     Attributes:
-        known: whether the motion to the present image is known or guessed.
+        known: whether the motion to the present image is given or extrapolated.
     """
 
     def __init__(self) -> None:
@@ -126,7 +125,7 @@ class CameraPath:
         self._last_stamp = 0
 
     def advance(self, stamp: int, pose: CameraPose | None) -> CameraMotion | None:
-        """The motion from the last image to the next one; None: none, or unknown.
+        """The motion from the last image to the next one; None if none or unknown.
 
         Args:
             stamp: of the image, ns.

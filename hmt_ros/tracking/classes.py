@@ -1,4 +1,4 @@
-"""Classes of a hypothesis that are chains: the way that it faces, and the sides of the detector.
+"""Classes of a hypothesis that are Markov chains: facing direction, and sides of the detector.
 
 Facing direction of the person: a two-state chain, whose evidence lasts as long as the track.
 
@@ -7,18 +7,18 @@ Facing direction of the person: a two-state chain, whose evidence lasts as long 
     S_t  = S_t- + b(min e_k (as the track faces) - min e_k (the other way))                     (2)
     b(d) = log (v e^d + 1 - v) - log (v + (1 - v) e^d)                                          (3)
 
-A camera hardly tells a pose from its reversal in depth (`body.mirror`), and a wrong one does not
-come right by small steps. S = logit p are the log odds that the person faces the other way than the
+A camera hardly distinguishes a pose from its reversal in depth (`body.mirror`), and small steps do
+not correct a wrong one. S = logit p are the log odds that the person faces the other way than the
 heaviest mode, Q the rate of the symmetry `reversal` (`body.body`), e_k the energy of an image at
-mode k. Nobody turns about from one image to the next: a hypothesis that faces the other way is
+mode k. Nobody turns round from one image to the next: a hypothesis that faces the other way is
 another history of the track, weighed with the evidence of all images so far for that history,
-whether a mode was kept of it or not. Seen from the side the two histories meet (1): t is the
-transition of the joints (`weighting`), h that of the heading, which wanders at the rate of the
-body. The best motion of either way stands for it (2), as the number of its modes is no evidence,
-nor is a motion that was not followed. An image shows the facing direction with the probability v,
-else something unrelated, like a flash or a covered lens (3): no single image turns a track about.
-A mode holds the odds of its own way: -S, or S where it faces back. To the ancestry of the modes a
-pair that faces different ways has
+even if none of its modes was kept. In a side view the two histories join (1): t is the transition
+density of the joints (`weighting`), h that of the heading, which diffuses at the rate of the body.
+The best motion of either way represents it (2), because neither the number of its modes nor a
+motion that was not followed is evidence. An image shows the facing direction with the probability
+v, else something unrelated, like a flash or a covered lens (3): no single image reverses a track.
+A mode stores the log odds of its own way: -S, or S if it faces the other way than the heaviest. In
+the ancestry of the modes the transition between poses that face different ways is
 
     log t(x_k, x_j) = log (exp min(log t, log h) + [exp(Q dt)]_ww')                             (6)
 
@@ -27,9 +27,9 @@ Exchange of left and right by the detector, in each mode from image to image:
     p(e_t | m) = sum_e' p(e_t | e') p(e' | ancestor of m),     p(e_t | e') = [exp(Q dt)]_e'e    (4)
     p(e_t | m, keypoints) ~ p(e_t | m) exp(-E_e(x_m))                                           (5)
 
-Q are the rates at which detectors begin and cease to exchange sides (`image.keypoint_schemes`). A
-person who is turned about and whose sides are exchanged looks the same to the keypoints as one who
-is not: the two differ in that people turn slowly and detectors change their mind at once.
+Q are the rates at which detectors start and stop to exchange sides (`image.keypoint_schemes`). A
+reversed pose with exchanged sides explains the same keypoints as the pose itself: the two differ in
+that people turn slowly, while detectors exchange sides at once.
 """
 
 from __future__ import annotations
@@ -55,18 +55,18 @@ from hmt_ros.tracking.weighting import Continuity
 EXCHANGES = MarkovChain(exchange_rates())
 
 
-# The way to face.
+# The facing direction.
 
 
 class Ways(NamedTuple):
-    """What is known of the two ways when hypotheses are weighed, for the core.
+    """Inputs of the core for weighing hypotheses of both facing directions.
 
     Attributes:
         before: (K,) modes that face the other way than the heaviest.
-        back: (N,) hypotheses that do.
-        variance: of turns since the image before, rad^2.
-        log_odds: of the other way, as the chain goes on.
-        price: -log of the probability that the way has changed meanwhile, nats.
+        back: (N,) hypotheses that face the other way than the heaviest mode.
+        variance: of the turn since the previous image, rad^2.
+        log_odds: of the other way, predicted by the chain.
+        price: -log of the probability that the way has changed since, nats.
         valid: share of the images that show the facing direction.
         most: bound on the log odds.
     """
@@ -83,7 +83,7 @@ class Ways(NamedTuple):
 def ways(body: Body, joints: Array, reference: Array) -> Mask:
     """Whether poses with joints (N, J, 3) face the other way than one with joints (J, 3).
 
-    With a body without a trunk none does.
+    All False for a body without a trunk.
     """
     if not body.trunk_pairs:
         return np.zeros(len(joints), dtype=np.bool_)
@@ -91,7 +91,7 @@ def ways(body: Body, joints: Array, reference: Array) -> Mask:
 
 
 def first_facing(body: Body, joints: Array, log_weights: Array) -> Array:
-    """Log odds (N,) of the way that each pose, by its joints, faces at the start of a track."""
+    """Log odds (N,) of the facing direction of each pose at the start of a track."""
     back = ways(body, joints, joints[np.argmax(log_weights)])
     log_odds = -MAX_FACING_NATS
     if back.any():
@@ -111,14 +111,14 @@ def lost_a_facing(back: Mask, log_weights: Array) -> bool:
 
 
 def best_of_the_other_way(body: Body, joints: Array, log_weights: Array, least: float) -> list[int]:
-    """The heaviest of N poses that faces the other way than the heaviest of all, if any.
+    """Index of the heaviest of N poses that faces the other way than the heaviest, if any.
 
-    It is kept as long as its way has any mass: small steps do not lead back to it.
+    It is kept as long as its way has any weight, because small steps do not find it again.
 
     Args:
         body: of the poses.
         joints, log_weights: (N, J, 3), (N,).
-        least: log weight relative to the heaviest below which a way has no mass.
+        least: log weight relative to the heaviest below which the weight counts as 0.
     """
     best = int(np.argmax(log_weights))
     back = np.flatnonzero(ways(body, joints, joints[best]))
@@ -135,20 +135,20 @@ def weigh_ways(
     evidence: Array,
     followed: Mask,
 ) -> tuple[Array, Array, Array]:
-    """Log weights (N,) of poses, in which either way has the weight of its history.
+    """Log weights (N,) of poses, where each facing direction has the weight of its history.
 
     Args:
-        modes: of the image before, K.
-        continuity: of the image, with the poses that they are moved to.
+        modes: of the previous image, K.
+        continuity: of the image, with the predicted poses of the modes.
         joints: (N, J, 3) of the poses, m.
         transitions: (K, N) log t(x_n, x_k) from the modes.
         log_weights: (N,); only their ratios within a way are used.
         evidence: (N,) energies of the image, nats.
-        followed: (N,) whether each has moved on from a mode.
+        followed: (N,) whether each did not jump with all degrees of freedom.
 
     Returns:
-        The log weights, the log odds (N,) of the way that each faces, and what (6) adds to log t
-        (K, N).
+        The log weights, the log odds (N,) of the facing direction of each, and the term (K, N) that
+        (6) adds to log t.
     """
     body, dt = continuity.body, continuity.dt
     log_odds = -float(modes.facing[0])
@@ -159,7 +159,7 @@ def weigh_ways(
     of_ways = Ways(
         modes.back,
         ways(body, joints, body.joint_positions(modes.poses[:1])[0]),
-        # People turn about as far as their pelvis wanders about the vertical by itself.
+        # The heading diffuses like the rotation of the pelvis about the vertical.
         float(body.rates[root_rotation_dofs(body.skeleton)[0]]) * dt,
         reversal.after(log_odds, dt),
         reversal.price(dt),
@@ -184,7 +184,7 @@ def predicted_exchanges(exchanges: Array, dt: float) -> Array:
 
 
 def known_exchanges(exchanges: Array) -> Array:
-    """Log probabilities (N, E) of exchanges of sides, where nothing is known the usual ones."""
+    """Log probabilities (N, E) of exchanges of sides, with the usual ones where unknown."""
     return np.where(np.isnan(exchanges), usual_exchanges(), exchanges)
 
 

@@ -1,4 +1,4 @@
-"""Whether a person is in view, as a probability: nobody is one more hypothesis of every image.
+"""The probability that a person is in view; every image may also show nobody.
 
     r = p(somebody is in view | images so far)
 
@@ -9,25 +9,25 @@ This is the existence of integrated probabilistic data association (Musicki, Eva
 "Integrated probabilistic data association", 1994) and of the Bernoulli filter (Ristic et al., "A
 tutorial on Bernoulli filters", 2013, equations 28 and 56), with rates per second in place of
 probabilities per scan. llr_g is the log likelihood ratio of the whole image for somebody against
-nobody by cue g, and a_g the share that is left to it because its errors last (`error_model`).
+nobody by cue g, and a_g its remaining share, because its errors persist (`error_model`).
 
     silhouette   m = max(share of the model on it / usual share, area of its largest piece that has
-                 the shape of a person / usual area), asked in the whole image
+                 the shape of a person / usual area), in the whole image
     detector     sum of the confidences of the keypoints
-    predictor    whether it expects somebody; a yes counts only where there is no silhouette
-    motion       whether the model moved, and nothing else; only where no other cue tells
-    colours      whether the person's are anywhere; only where nothing else shows somebody, and
-                 against somebody only where the scene is the one they were learned in
+    predictor    whether it predicts a person; a yes counts only if there is no silhouette
+    motion       whether the model moved, and nothing else; only if there is no other cue
+    colours      whether the person's colours are anywhere; only if nothing else shows a person, and
+                 against a person only in the scene where they were learned
 
-Before a track, keypoints count once for a picture: a detector that takes the foot of a table for a
-person does so in every image that shows the same. People move, if only a little.
+Before a track, keypoints count once per picture: a detector that confuses the foot of a table with
+a person does so in every image that shows the same. People move, if only a little.
 
-Who was there still is if nothing at all has moved: time does not count then.
+If nothing at all has moved, a person who was in view still is, so the prediction is skipped.
 
-An image that has changed for the most part is no evidence: a covered lens, a flash, noise. The
-colours of a track are no evidence against somebody when the camera has moved: they may have been
-those of a thing. For a person hidden by others, only evidence for the person counts. So only an
-image that shows the place empty ends a track: without it r tends to b / (b + l), which is far above
+An image that has mostly changed is no evidence: a covered lens, a flash, noise. The colours of a
+track are no evidence against a person when the camera has moved: they may have been those of an
+object. For a person hidden by others, only evidence for the person counts. So only an image of the
+empty place ends a track: without it r tends to b / (b + l), which is far above
 `ABSENT_PROBABILITY`.
 """
 
@@ -77,7 +77,7 @@ class Cue(NamedTuple):
 
     Attributes:
         nats: largest log likelihood ratio of somebody against nobody.
-        tau: how long its errors last, s.
+        tau: duration of its errors, s.
     """
 
     nats: float
@@ -86,24 +86,24 @@ class Cue(NamedTuple):
 
 CLEAR, DOUBTFUL = (Cue(*EXISTENCE_CUES[name]) for name in ('clear', 'doubtful'))
 
-# Probability before the first image, as after one clear image of nobody; a given start counts like
-# one clear image of somebody.
+# Probability before the first image, as after one clear image of nobody, and that of a given start,
+# as after one clear image of a person.
 NOBODY_YET, GIVEN = of_log_odds([-CLEAR.nats, CLEAR.nats])[:, 1].tolist()
 
 
 class Sighting(NamedTuple):
-    """Whom an image shows, by all cues.
+    """Evidence of an image for a person, by all cues.
 
     Attributes:
-        said: log likelihood ratios by cue, nats; positive: somebody.
-        seen: whether it shows a filter something to follow: a cue shows somebody, or none shows
-            nobody and the image can be used.
-        blank: whether nothing is there to fit modes to, as others hide most of the person or as the
-            silhouette is that of nobody.
+        said: log likelihood ratios by cue, nats; positive: a person is in view.
+        seen: whether the image shows a person to track: a cue shows a person, or the image is
+            usable and no cue speaks against a person.
+        blank: whether the image gives nothing to fit modes to: others hide most of the person, or
+            the silhouette shows nobody.
         hidden: whether others hide most of the person.
-        elsewhere: whether it shows somebody where no mode is, or after so long that the modes are
-            of no use: the track has to search.
-        there: whether it shows the person, or the same as an image that did.
+        elsewhere: whether the image shows a person away from all modes, or after so long that the
+            modes are useless: the track has to search.
+        there: whether the image shows the person, or equals an image that did.
     """
 
     said: Mapping[str, float] = MappingProxyType({})
@@ -115,7 +115,7 @@ class Sighting(NamedTuple):
 
     @property
     def llr(self) -> float:
-        """Sum of the cues, nats; positive: it shows somebody."""
+        """Sum over the cues, nats; positive: a person is in view."""
         return sum(self.said.values())
 
 
@@ -126,8 +126,8 @@ class Existence:
         probability: before the first image.
 
     Attributes:
-        last: what the last image shows.
-        told: when each cue spoke last, ns.
+        last: evidence of the last image.
+        told: stamp of the last evidence of each cue, ns.
         appearance: of the person.
     """
 
@@ -161,21 +161,21 @@ class Existence:
         return self.probability < ABSENT_PROBABILITY and self.last.llr < 0.0
 
     def look(self, view: View, body: Body, *, waiting: bool = False) -> None:
-        """Takes the next image.
+        """Updates the probability by the next image.
 
         Args:
-            view: of the image, later than the one before.
+            view: of the image, later than the previous one.
             body: of the person.
-            waiting: whether a track has still to start.
+            waiting: whether no track has started yet.
         """
         stamp = view.stamp
-        # Nothing but the image tells, so that its changes are worth a look.
+        # Motion is a cue only if there is no other.
         alone = view.anywhere is None and view.keypoints is None and not waiting
         motion = self.appearance.motion(view) if alone else NO_MOTION
         still = motion.still and self.last.there
         if self._stamps is not None and not still:
             self._p = CHAIN.predict(self._p, seconds(stamp - self._stamps[1]))
-        # After so long a time the person who was seen last may have gone.
+        # After a long time unseen, the person may have left.
         forgotten = bool(CHAIN.closed(1.0, self.appearance.unseen(stamp)) < MAJORITY)
         hidden = self.appearance.open_to_view(view.others) < 1.0 - MAJORITY
         cues, usable, apart = self._cues(view, body)
@@ -211,8 +211,8 @@ class Existence:
         """Values of the cues by name, from -1, nobody, to 1, and two facts about the image.
 
         Returns:
-            The cues that are evidence; whether the silhouette can be used, as far as there is
-            one; whether somebody is shown where the model is not.
+            The cues that are evidence; whether a silhouette, if there is one, is usable; whether a
+            person is shown away from the model.
         """
         cues, apart = {}, False
         usable = view.anywhere is None
@@ -234,7 +234,7 @@ class Existence:
             cues['predictor'] = (1.0, CLEAR) if view.predicted else (-1.0, DOUBTFUL)
         if found is None and not any(value > 0.0 for value, _ in cues.values()):
             colours = self.appearance.colour_evidence(view)
-            # Where most of the image has changed, the colours may have, too.
+            # If most of the image has changed, the colours may have changed, too.
             if colours is not None and (usable or colours[0]):
                 there, part = colours
                 nats = part * DOUBTFUL.nats
@@ -242,7 +242,7 @@ class Existence:
         return cues, usable, apart
 
     def _time_since(self, cue: str, stamp: int) -> float:
-        """Time since a cue spoke, s; infinite in the first image."""
+        """Time since the last evidence of a cue, s; infinite in the first image."""
         if self._stamps is None:
             return math.inf
         return seconds(stamp - self.told.get(cue, self._stamps[0]))

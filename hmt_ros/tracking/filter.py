@@ -4,7 +4,7 @@ predict     x_k | ancestor       motion prior, optical flow                     
 propose     x_k^0                jumps, samples, predictions of others            proposals
 optimise    x_k = argmin E(x)    bounded Newton from x_k^0                        optimisation
 weigh       log w_k = log sum_j w_j p(x_k | x_j) - sum_g a_g E_g(x_k)             weighting
-select      K of N hypotheses    the least expected distance to one that is kept  selection
+select      K of N hypotheses    least expected distance to the nearest kept one  selection
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Judged(NamedTuple):
 
     Attributes:
         misfits: by cue, and of the outline of the silhouette.
-        alone: the pose by keypoints alone; None: the modes explain enough of them.
+        alone: the pose by keypoints alone; None: not needed.
     """
 
     misfits: dict[str, Misfit]
@@ -83,18 +83,18 @@ class MixtureFilter:
     Args:
         body: of the person.
         camera: that sees the person.
-        settings: how.
+        settings: of the tracker.
         seed: of all randomness.
         extra: further energy terms.
         ground: gravity and floor; None: not used.
 
     Attributes:
-        body: with the lengths and the flesh that have been estimated.
-        dynamics: how modes move by themselves.
-        modes: the present ones, heaviest first; none before the start.
-        published: the same, where limbs that no image shows are as people hold them.
+        body: with the estimated lengths and flesh.
+        dynamics: motion prior of the modes.
+        modes: present modes, heaviest first; empty before the start.
+        published: the modes, with unseen limbs spread over usual postures.
         shape: the estimate of lengths and flesh.
-        limbs: which of them the images show.
+        limbs: visibility of the limbs in the images.
         misfit: share of the last image that no mode explains.
         spent: numbers of evaluations of the likelihood in the last image.
     """
@@ -111,7 +111,7 @@ class MixtureFilter:
         self.camera = camera
         self.settings = settings
         self.modes = self.published = Modes.blank(0, body.dimension)
-        # The mode that each of the published ones comes from.
+        # For each published mode, the row of its source in `modes`.
         self._sources = np.empty(0, dtype=np.intp)
         self.limbs = UnseenLimbs(body)
         self.shape = ShapeEstimate(body)
@@ -129,7 +129,7 @@ class MixtureFilter:
 
     @property
     def person(self) -> Body:
-        """The body, whose joints err more where no image shows them."""
+        """The body, with a larger error of joints that no image shows."""
         return self.limbs.told(self.body)
 
     # The start.
@@ -165,7 +165,7 @@ class MixtureFilter:
         return self._judge(observation)
 
     def begin_anew(self, poses: Array, observation: Observation) -> Judged:
-        """Starts from an image, the present modes and poses (N, d) to search from."""
+        """Restarts at an image, from the present modes and from poses (N, d)."""
         self.spent.clear()
         poses = np.concatenate([self.modes.poses, poses])
         term = self.posterior.of_image(observation)
@@ -191,7 +191,7 @@ class MixtureFilter:
     # One image after another.
 
     def carry(self, motion: CameraMotion) -> None:
-        """Takes everything that has a place into the camera frame of the next image."""
+        """Transforms modes and poses to the camera frame of the next image."""
         self.modes = motion.modes(self.body, self.modes)
         self.published = motion.modes(self.body, self.published)
         if self._by_keypoints.pose is not None:
@@ -200,11 +200,11 @@ class MixtureFilter:
     def propagate(
         self, observation: Observation, dt: float, prediction: PosePrediction | None
     ) -> Judged:
-        """Moves the mixture on to the next image.
+        """Propagates the mixture to the next image.
 
         Args:
             observation: of the image.
-            dt: since the last image, s.
+            dt: time since the previous image, s.
             prediction: pose hypotheses from an external predictor, if any.
         """
         s, modes, posterior = self.settings, self.modes, self.posterior
@@ -233,7 +233,7 @@ class MixtureFilter:
             base = base.joined(search.optimise(placed).minima)
             search, predicted = replace(search, base=base), joined([predicted, placed])
         candidates = propose(self._proposals, search, predicted, self._rng)
-        # Every mode goes on, whatever else is proposed.
+        # Every mode also continues without a jump.
         found = search.optimise(candidates).joined(Optimised(predicted, base))
         self._select(*self._weigh(search, found), observation, search)
         self._fit_shape(observation, ERRORS['shape'].share(dt))
@@ -244,10 +244,10 @@ class MixtureFilter:
     def _weigh(
         self, search: Search, optimised: Optimised
     ) -> tuple[Optimised, Array, Array, Array, Array]:
-        """The hypotheses that are distinct, with their weights: what `_select` takes."""
+        """The first five arguments of `_select`: distinct hypotheses and their weights."""
         optimised = _finite(optimised)
         evidence = search.evidence(optimised)
-        # Where hypotheses meet, one that has moved there is kept before one that has jumped.
+        # Of equal hypotheses, those that moved there precede those that jumped.
         followed = np.asarray(~optimised.hypotheses.jumped.any(1))
         order = np.lexsort((evidence, ~followed))
         joints = self.body.joint_positions(optimised.minima.x)
@@ -278,17 +278,17 @@ class MixtureFilter:
         observation: Observation,
         search: Search | None,
     ) -> None:
-        """Makes the modes of an image.
+        """Selects the modes of an image.
 
         Args:
             optimised: N distinct hypotheses at their optima.
             joints: (N, J, 3) of these, m.
             log_weights: (N,).
-            facing: (N,) log odds of the way that each faces.
-            histories: (K, N) log w_k p(x_n | x_k), of K modes before, for the ancestry; K is 0
-                where modes begin.
+            facing: (N,) log odds of the facing direction of each.
+            histories: (K, N) log w_k p(x_n | x_k) of the K previous modes, for the ancestry; K is 0
+                at a start.
             observation: of the image.
-            search: that led to the hypotheses; None: the modes begin.
+            search: that found the hypotheses; None: the track starts.
         """
         s, posterior, poses = self.settings, self.posterior, optimised.minima.x
         before = None if search is None else search.modes
@@ -338,7 +338,7 @@ class MixtureFilter:
             self._points = seen_points(posterior.body, self.camera, frames, observation.others)
 
     def _publish(self, modes: Modes) -> None:
-        """Makes the modes that are published, and what they come from in the image before."""
+        """Sets the published modes, and their origins among those of the previous image."""
         before, self._sources = self._sources, np.arange(len(modes))
         weights = elementary.exp(self.published.log_weights)
         unseen = self.limbs.of_dofs(self.body)
@@ -363,7 +363,7 @@ class MixtureFilter:
 
         Args:
             observation: of the image.
-            search: that led to the modes; None: they begin.
+            search: that found the modes; None: the track starts.
         """
         modes, s, alone = self.modes, self.settings.likelihood, None
         found = of_silhouette(
@@ -387,7 +387,7 @@ class MixtureFilter:
         return Judged(found, alone)
 
     def _fit_shape(self, observation: Observation, trust: float) -> bool:
-        """Moves the shape by the evidence of an image; False if there is none."""
+        """Updates the shape by an image; returns False if it has no evidence for it."""
         if not self.settings.estimate_shape:
             return False
         if observation.outline is None and observation.keypoints is None:
@@ -410,7 +410,7 @@ class MixtureFilter:
         return True
 
     def _use_body(self, body: Body) -> None:
-        """Goes on with a body of the same degrees of freedom."""
+        """Replaces the body by one with the same degrees of freedom."""
         self.body = body
         self.dynamics = dynamics_of(body, self.settings.motion)
         self.posterior = Posterior(
@@ -422,7 +422,7 @@ def _finite(optimised: Optimised) -> Optimised:
     """Hypotheses of finite energy.
 
     Raises:
-        ValueError: there is none.
+        ValueError: no hypothesis has a finite energy.
     """
     usable = np.isfinite(optimised.minima.value)
     if not usable.any():

@@ -3,12 +3,12 @@
     h(p) = n . p + d        height of a point p over the floor, camera frame, m
 
 with n the unit vector against gravity and d the height of the camera. Unknown values are estimated
-from the track; see `GroundEstimator`. Given ones are measurements: others refine them within their
-error,
+from the track; see `GroundEstimator`. Given values are measurements: others refine them within
+their error,
 
     p(n | v) ~ N(n; n_0, s_0^2) [p N(v; n, s^2) + 1 - p],     v the vertical of the lines
 
-and contradict them, but never replace them.
+and may contradict them, but never replace them.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ from hmt_ros.tracking.settings import (
 
 @dataclass(frozen=True)
 class KnownGround:
-    """Gravity and floor, as far as they are known without the images.
+    """Prior knowledge of gravity and floor.
 
     Attributes:
         up: (3,) unit vector against gravity in the camera frame; None: unknown.
@@ -87,22 +87,22 @@ class KnownGround:
 
 
 class Ground(FloorPlane):
-    """The present estimate of the ground, at the camera or where the person is.
+    """The present estimate of the ground, at the camera or at the person.
 
-    The height has the deviation inf where it is unknown.
+    The standard deviation of an unknown height is inf.
     """
 
     @property
     def plane(self) -> Array | None:
-        """(4,) n and d with n . x + d = 0 on the floor; None: the height is unknown."""
+        """(4,) n and d with n . x + d = 0 on the floor; None if the height is unknown."""
         return None if self.height is None else np.append(self.up, self.height)
 
 
 def unit_vector(up: ArrayLike) -> Array:
-    """A direction (3,) of unit length.
+    """Checks a direction (3,) and normalises it.
 
     Raises:
-        ValueError: another shape, or a length that is not 1 within 1 %.
+        ValueError: another shape, or a length that differs from 1 by 1 % or more.
     """
     vector = np.array(up, dtype=np.float64)
     size = length(vector) if vector.shape == IMAGE_UP.shape else np.nan
@@ -118,31 +118,29 @@ def unit_vector(up: ArrayLike) -> Array:
 class GroundEstimator:
     """Estimates the ground from prior knowledge, from the scene and from a track.
 
-    The height of the floor follows the lowest sole: a person stands on the floor for most of the
-    time, and jumps at times, so it is a high quantile of the last seconds. The vertical is the
-    given one, which the lines of the scene (`image.vertical_lines`) refine. Without one it is that
-    of the lines; where they show none, it is near the vertical of the image, and near the axis of a
-    body that stands, from the middle of the feet to the centre of mass. Errors of that
-    axis last, so its images count as one per `VERTICAL_TIME`, and the deviation never goes below
-    `AXIS_SIGMA`.
+    The floor is a high quantile of the distance of the lowest sole below the camera in the last
+    seconds: people mostly stand on the floor, and sometimes jump. The lines of the scene
+    (`image.vertical_lines`) refine a given vertical. If none is given, the vertical is that of the
+    lines; without lines it is near the vertical of the image, and near the axis of a standing body,
+    from the middle of the feet to the centre of mass. Errors of that axis persist, so its images
+    count as one per `VERTICAL_TIME`, and its standard deviation is at least `AXIS_SIGMA`.
 
-    Lines that show another vertical, and a person who lies by it, make a given one doubtful. It may
-    be the wrong way round, as an accelerometer at rest measures gravity: where keypoints show the
-    person head down, from the first image on where it points down in the image, else for
-    `HEAD_DOWN_IMAGES` images, its opposite is used. A jump of the vertical of the lines alone is
-    believed when the next look shows it too.
+    A given vertical is doubted if the lines show another one, or if it makes the person lie. It may
+    have the wrong sign, that of an accelerometer at rest. Its opposite is used where keypoints show
+    the person head down: from the first image if it points down in the image, else after
+    `HEAD_DOWN_IMAGES` images. A jump of the vertical of the lines is accepted if the next look
+    confirms it.
 
     Args:
-        known: gravity and floor without the images; None: unknown.
+        known: prior knowledge of gravity and floor; None: unknown.
 
     Attributes:
-        known: gravity and floor without the images.
-        estimate: the present estimate.
+        known: prior knowledge of gravity and floor.
+        estimate: the present estimate at the camera.
         still: whether the motion of the camera is known, so that things at rest have known places
             in its frame; set by the tracker.
-        plane: gravity and floor where the person is, for the energy of poses.
-        turning: whether a newer direction of gravity contradicts the rotation of the camera that
-            was assumed.
+        plane: gravity and floor at the person, for the energy of poses.
+        turning: whether the last given direction of gravity shows that the camera turned.
     """
 
     def __init__(self, known: KnownGround | None = None) -> None:
@@ -168,9 +166,9 @@ class GroundEstimator:
         self._conclude()
 
     def carry(self, motion: CameraMotion) -> None:
-        """Takes known and estimated values into the camera frame of the next image.
+        """Transforms known and estimated values to the camera frame of the next image.
 
-        A camera height that would not be positive any more is unknown from then on.
+        A camera height that would become zero or negative is dropped.
         """
         up = motion.directions(self.estimate.up)
         rise = -_dot(up, motion.translation)
@@ -192,7 +190,7 @@ class GroundEstimator:
     def set_gravity(
         self, up: ArrayLike, camera_height: float | None = None, up_sigma: float = GIVEN_UP_SIGMA
     ) -> None:
-        """Takes a newer direction (3,) against gravity, camera frame, and height of the camera."""
+        """Sets a newer direction (3,) against gravity, camera frame, and height of the camera."""
         before, vector = self.known.up, unit_vector(up)
         self.turning = before is not None and length(vector - before) > TURN_NOISE
         height = self.known.camera_height if camera_height is None else camera_height
@@ -209,28 +207,28 @@ class GroundEstimator:
 
     @property
     def contradicted(self) -> bool:
-        """Whether lines of the scene, or the person, contradict the vertical that is given."""
+        """Whether lines of the scene, or the person, contradict the given vertical."""
         given = self._given
         if given is None:
             return False
-        # A camera that hangs or lies is more often given the wrong one.
+        # Gravity is more often wrong for a camera that hangs or lies.
         upright = _dot(given, IMAGE_UP) >= 0.5
         prior = -RIGHT_VERTICAL_NATS if upright else 1.0 - RIGHT_VERTICAL_NATS
         return prior + self._by_lines + self._by_person > 0.0
 
     @property
     def level(self) -> Array:
-        """(3, 3) from an upright camera's axes to the camera's, as far as the vertical is known."""
+        """(3, 3) from an upright camera's axes to the camera's; identity if that is unknown."""
         return roll(self.estimate.up) if self.vertical_known else AXES.copy()
 
     @property
     def _given(self) -> Array | None:
-        """(3,) the given vertical, whose sign may have been that of an accelerometer."""
+        """(3,) the given vertical, with its sign corrected; None if none is given."""
         up = self.known.up
         return up if up is None or not self.reversed else -up
 
     def see(self, keypoints: Keypoints) -> None:
-        """Takes in which way up a detector sees the person, by names of our joints."""
+        """Updates the sign of the given vertical by the trunk of a detected person."""
         if self.known.up is not None:
             trunk = keypoints.trunk
             size = max(length(trunk), np.finfo(np.float64).eps)
@@ -238,7 +236,7 @@ class GroundEstimator:
             self._conclude()
 
     def look(self, image: Image, camera: Camera, stamp: int) -> None:
-        """Takes in the lines of an image, if it is time to; a stamp is in ns."""
+        """Updates the vertical by the lines of an image, once per `VERTICAL_TIME`; stamp in ns."""
         if self._looked is not None and 0 <= seconds(stamp - self._looked) < VERTICAL_TIME:
             return
         self._looked, given = stamp, self._given
@@ -257,16 +255,16 @@ class GroundEstimator:
 
     @property
     def vertical_known(self) -> bool:
-        """Whether the vertical is given, or the lines of the scene show it; else it is guessed."""
+        """Whether the vertical is given or shown by lines of the scene, not guessed."""
         return self.known.up is not None or self._seen is not None
 
     @property
     def vertical(self) -> Array | None:
-        """(3,) the vertical, camera frame, as given or as the lines show it; None: unknown."""
+        """(3,) the given vertical, or that of the lines, camera frame; None if unknown."""
         return self.estimate.up if self.vertical_known else None
 
     def gravity(self, weight: float) -> Gravity | None:
-        """Gravity for a start, with a factor on its energy; None: it is unknown, or not used."""
+        """Gravity for a start, with a factor on its energy; None if unknown or not used."""
         return Gravity(self.plane, weight) if self.vertical_known and weight > 0 else None
 
     def with_contacts(self, body: Body, modes: Modes, before: Modes | None, dt: float) -> Modes:
@@ -275,9 +273,9 @@ class GroundEstimator:
         Args:
             body: of the modes.
             modes: of an image.
-            before: modes of the image before, in the same camera frame, where the ancestors are;
-                None: the modes come from nothing before.
-            dt: time since then, s.
+            before: modes of the previous image, in the same camera frame, among which the
+                ancestors are; None: the track starts.
+            dt: time since the previous image, s.
         """
         points = sole_points(body, modes.poses)
         if before is None:
@@ -289,8 +287,8 @@ class GroundEstimator:
     def by_foot(self, modes: Modes) -> dict[str, float]:
         """Probability that the heaviest mode rests on a foot, by 'left_foot' and 'right_foot'.
 
-        Empty without modes, where the terms of the ground are off, for a body without feet, and
-        while the motion of the camera is unknown.
+        Empty if there are no modes, if the ground terms are off, if the body has no feet, or while
+        the motion of the camera is unknown.
         """
         if not (self.still and modes.contacts.size):
             return {}
@@ -298,13 +296,13 @@ class GroundEstimator:
         return {f'{side}_foot': float(p) for side, p in zip(FEET, best, strict=True)}
 
     def update(self, body: Body, modes: Modes, resting: float, dt: float) -> None:
-        """Takes in the modes of an image.
+        """Updates vertical and floor by the modes of an image.
 
         Args:
             body: of the modes.
             modes: of the posterior.
             resting: probability that both feet rest.
-            dt: since the image before, s.
+            dt: time since the previous image, s.
         """
         feet, mass = soles(body), masses(body.skeleton)
         if not len(feet):
@@ -331,7 +329,7 @@ class GroundEstimator:
         self._conclude()
 
     def _said_by_person(self, cosine: float, dt: float) -> float:
-        """Nats against the given vertical after an image where a person stands at this cosine."""
+        """Log odds against the given vertical, nats, by the cosine of a person's axis to it."""
         stands = 2.0 * UPRIGHT_CONCENTRATION
         stands *= elementary.exp(UPRIGHT_CONCENTRATION * (cosine - 1.0))
         most = RIGHT_VERTICAL_NATS * (1.0 + max(-cosine, 0.0))
@@ -339,7 +337,7 @@ class GroundEstimator:
         return min(max(self._by_person + float(said), -RIGHT_VERTICAL_NATS), most)
 
     def _follow_axis(self, axis: Array, place: Array, resting: float, dt: float) -> None:
-        """Moves the vertical by the mean axis (3,) of the body at a place (3,)."""
+        """Updates the vertical by the mean axis (3,) of the body at a place (3,)."""
         size = length(axis)
         if dt <= 0 or resting <= 0 or size == 0:
             return
@@ -372,13 +370,13 @@ class GroundEstimator:
         self.estimate = self.plane = tracked
         if known.camera_height is not None:
             self.estimate = Ground(seen.up, seen.sigma, known.camera_height, 2.0 * MEASURED_SIGMA)
-            # An error of the vertical lifts the floor where the person is.
+            # An error of the vertical shifts the floor at the person.
             sigma = math.hypot(self.estimate.height_sigma, seen.sigma * self._distance)
             if sigma <= tracked.height_sigma:
                 self.plane = replace(self.estimate, height_sigma=sigma)
 
     def _tracked_level(self) -> tuple[float | None, float]:
-        """Height of the camera over the lowest soles of the last seconds, and its deviation, m."""
+        """Height of the camera over the soles of the last seconds, and its deviation, m."""
         if not self._levels:
             return None, np.inf
         levels = sorted(level for _, level in self._levels)
@@ -393,7 +391,7 @@ def _dot(a: Array, b: Array) -> float:
 
 
 def _quantile(rising: list[float], share: float) -> float:
-    """The value that a share of values does not exceed, interpolated."""
+    """Quantile of sorted values, interpolated."""
     place = share * (len(rising) - 1)
     first = int(place)
     low, high = rising[first], rising[min(first + 1, len(rising) - 1)]
@@ -402,10 +400,10 @@ def _quantile(rising: list[float], share: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Gravity:
-    """Gravity as it is known when a track starts; the floor is unknown then.
+    """Gravity at the start of a track, when the floor is unknown.
 
     Attributes:
-        plane: with the direction against gravity and its deviation; the height is not used.
+        plane: the direction against gravity and its deviation; the height is not used.
         weight: factor on the energy of the lean, more than 0.
     """
 
@@ -413,11 +411,11 @@ class Gravity:
     weight: float = 1.0
 
     def term(self, body: Body) -> GroundTerm:
-        """The energy of the lean of pelvis and trunk of a body."""
+        """The energy of the lean of a body's pelvis and trunk."""
         plane = replace(self.plane, height=None, height_sigma=np.inf)
         return GroundTerm(body, GroundSettings(self.weight, 0.0), plane)
 
     def turned(self, body: Body, poses: Array) -> Array:
-        """Poses (N, d) upright in the image, turned the shortest way to be upright in space."""
+        """Turns poses (N, d), upright in the image, by the shortest rotation to the vertical."""
         turn = shortest_turn(product(body.level, IMAGE_UP), self.plane.up)
         return np.clip(turned(body, poses, body, turn), body.lower, body.upper)

@@ -1,9 +1,10 @@
-"""Hypotheses about the pose, from one image to the next: the record that the five steps share.
+"""Pose hypotheses from one image to the next: the data that the five steps share.
 
     predict -> propose -> optimise -> weigh -> select
 
-A hypothesis is born with an ancestor, jumps, and a pose where it is expected. It gets a pose that
-is locally optimal and a weight; if it is selected it is a mode, with covariances.
+A hypothesis is created with an ancestor, its jumped variables and an expected pose. Optimisation
+gives it a locally optimal pose, weighing a weight; a selected hypothesis is a mode, with
+covariances.
 """
 
 from __future__ import annotations
@@ -31,16 +32,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """N weighted poses, and how they came about.
+    """N weighted poses and their ancestry.
 
     Attributes:
         poses: (N, d).
-        log_weights: (N,) of the ancestors; of modes log posterior probabilities.
-        ancestors: (N,) mode of the image before that each comes from.
-        expected: (N, d) pose that the motion prior is centred at.
-        jumped: (N, d) degrees of freedom that did not move there, but jumped.
-        exchanges: (N, E) log probabilities that the detector exchanges sides: before the image; of
-            modes after it. NaN: nothing is known of the detector.
+        log_weights: (N,) of the ancestors; for modes, log posterior probabilities.
+        ancestors: (N,) row of the mode of the previous image that each continues.
+        expected: (N, d) centres of the motion prior.
+        jumped: (N, d) degrees of freedom that jumped instead of following the motion prior.
+        exchanges: (N, E) log probabilities that the detector exchanges sides, before the image; for
+            modes, after it. NaN: unknown.
     """
 
     poses: Array
@@ -54,7 +55,7 @@ class Hypotheses:
         return len(self.poses)
 
     def __getitem__(self, rows: Index | slice) -> Self:
-        """Some of them."""
+        """The hypotheses of some rows."""
         names = self.__dataclass_fields__
         return type(self)(**{name: getattr(self, name)[rows] for name in names})
 
@@ -63,31 +64,31 @@ class Hypotheses:
     ) -> Hypotheses:
         """Hypotheses at other poses (N, d).
 
-        One that has jumped with all degrees of freedom says that the track was wrong: of the
-        detector nothing is known then.
+        A hypothesis that jumps with all degrees of freedom assumes that the track was wrong, so its
+        probabilities of exchanged sides are unknown.
 
         Args:
-            rows: (N,) of these hypotheses, that they come from.
+            rows: (N,) of the hypotheses that they are derived from.
             poses: (N, d).
-            jumped: (N, d) degrees of freedom that have jumped.
-            expected: (N, d) centres of the motion prior; None: where they have jumped to, else
-                those of the hypotheses that they come from.
+            jumped: (N, d) degrees of freedom that jump.
+            expected: (N, d) centres of the motion prior; None: the new values of jumped degrees of
+                freedom, else those of the source hypotheses.
         """
         if expected is None:
             expected = np.where(jumped, poses, self.expected[rows])
-        anew = np.all(jumped, axis=1, keepdims=True)
+        again = np.all(jumped, axis=1, keepdims=True)
         return Hypotheses(
             poses,
             self.log_weights[rows],
             self.ancestors[rows],
             expected,
             jumped,
-            np.where(anew, np.nan, self.exchanges[rows]),
+            np.where(again, np.nan, self.exchanges[rows]),
         )
 
 
 def joined(parts: Sequence[Hypotheses]) -> Hypotheses:
-    """All hypotheses of some proposals."""
+    """Concatenates hypotheses."""
     names = Hypotheses.__dataclass_fields__
     arrays: list[Any] = [np.concatenate([getattr(x, name) for x in parts]) for name in names]
     return Hypotheses(*arrays)
@@ -98,7 +99,7 @@ class Optimised:
     """Hypotheses at their optima.
 
     Attributes:
-        hypotheses: N of them; their poses are where they started from.
+        hypotheses: N; their poses are the starting points.
         minima: N rows; Hessians are those of the Gaussian posterior.
     """
 
@@ -109,7 +110,7 @@ class Optimised:
         return Optimised(self.hypotheses[rows], self.minima[rows])
 
     def joined(self, other: Optimised) -> Optimised:
-        """These and others."""
+        """These hypotheses followed by others."""
         return Optimised(
             joined([self.hypotheses, other.hypotheses]), self.minima.joined(other.minima)
         )
@@ -117,23 +118,23 @@ class Optimised:
 
 @dataclass(frozen=True, eq=False)
 class Modes(Hypotheses):
-    """Hypotheses that were optimised, weighed and selected: the mixture that is carried on.
+    """Optimised, weighed and selected hypotheses: the mixture that is propagated.
 
     Attributes:
         velocities: (N, d) per second.
-        covariances: (N, d, d) of the posterior, as certain as all images so far make them.
+        covariances: (N, d, d) of the posterior, given all images so far.
         filtered: (N, d, d) covariances as if errors were independent from image to image.
         log_likelihoods: (N,) of the image.
         state_covariances: (N, n, n) of poses and velocities, which are propagated. For a random
             walk they are `filtered`; with velocities each image counts with a share, because errors
-            last.
+            persist.
         identities: (N,) see `Identities`.
-        origins: (N, M) probability that each continues mode m of the image before; M is 0 where
-            the modes begin.
+        origins: (N, M) probability that each continues mode m of the previous image; M is 0 at a
+            start.
         back: (N,) modes that face the other way than the heaviest, which is the first.
-        facing: (N,) log odds of the way that each faces, see `classes`.
+        facing: (N,) log odds of the facing direction of each, see `classes`.
         soles: (N, P, 3) points of the soles, m.
-        contacts: (N, P) probabilities that these rest on the floor, see `contact`.
+        contacts: (N, P) probabilities that these rest on the floor, see `body.foot_contact`.
     """
 
     velocities: Array
@@ -150,7 +151,7 @@ class Modes(Hypotheses):
 
     @classmethod
     def blank(cls, count: int, dimension: int) -> Modes:
-        """K modes of which nothing is known yet; none where there is no track."""
+        """K modes with all values zero or empty; K is 0 without a track."""
         numbers, vectors = np.zeros(count), np.zeros((count, dimension))
         matrices, nothing = np.zeros((count, dimension, dimension)), np.zeros((count, 0))
         return cls(
@@ -176,18 +177,18 @@ class Modes(Hypotheses):
 
 
 class Identities:
-    """Numbers of the modes of a track, from 1 on, that last from image to image.
+    """Persistent numbers of the modes of a track, from 1 on.
 
-    A mode keeps the number of its ancestor if it is the heaviest of the descendants that moved
-    there, or, where all of them have jumped with some limb, the heaviest of these. Every other
-    mode, and one that was placed anew as a whole, gets a number that no mode has had before.
+    A mode inherits the number of its ancestor if it is the heaviest descendant without a jump, or,
+    where every descendant jumped, the heaviest that did not jump with all degrees of freedom. Every
+    other mode gets a new number.
     """
 
     def __init__(self) -> None:
         self._last = 0
 
     def new(self, count: int) -> Index:
-        """Numbers (count,) that no mode has had."""
+        """Unused numbers (count,)."""
         first, self._last = self._last + 1, self._last + count
         return np.arange(first, self._last + 1)
 
@@ -196,7 +197,7 @@ class Identities:
 
         Args:
             hypotheses: N.
-            before: modes of the image before; None: they begin.
+            before: modes of the previous image; None: the track starts.
         """
         if before is None:
             return self.new(len(hypotheses))
@@ -220,7 +221,7 @@ def new_hypotheses(poses: Array, log_weights: Array, exchanges: Array | None = N
 
     Args:
         poses, log_weights: (N, d), (N,).
-        exchanges: (N, E) log probabilities of exchanged sides; None: nothing is known.
+        exchanges: (N, E) log probabilities of exchanged sides; None: unknown.
     """
     everyone = np.arange(len(poses))
     still = np.zeros(poses.shape, dtype=np.bool_)
@@ -231,11 +232,11 @@ def new_hypotheses(poses: Array, log_weights: Array, exchanges: Array | None = N
 
 @dataclass(frozen=True, eq=False)
 class PosePrediction:
-    """Poses that an external single-image predictor expects, such as a mixture of experts.
+    """Poses from an external single-image predictor, such as a mixture of experts.
 
     Attributes:
         mixture: over poses (d,), with some weight above 0.
-        body: of the poses, at the lengths that were assumed.
+        body: of the poses, with the assumed lengths.
 
     Raises:
         ValueError: a mixture that is not over poses of the body.
@@ -254,7 +255,7 @@ class PosePrediction:
             raise ValueError('a prediction has no weight')
 
     def seen_as(self, body: Body) -> GaussianMixture:
-        """The same for a person of other lengths or level, at a distance in proportion to the size.
+        """The mixture for a body of other lengths or level; distances scale with its size.
 
         Raises:
             ValueError: a body with other degrees of freedom.

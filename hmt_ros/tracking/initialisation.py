@@ -2,12 +2,11 @@
 
     E(x, l) = 1/2 sum_j |u_j(x, l) - p_j|^2_j + E_prior(x) + 1/2 (l - l_0)' S_l^-1 (l - l_0)
 
-u_j projects joint j of the pose x with the lengths l, which was seen at p_j; the norm is that of
-the keypoint's covariance. From several headings the pose is fitted together with the lengths, each
-length held by its measurement or by its spread over people, upright against gravity as far as
-that is known, and at the depths of a depth image, if there is one. The lengths are then fixed, the
-flips of all limbs that the image and the limits allow are enumerated and fitted again, and the best
-are the first mixture.
+u_j projects joint j, seen at p_j, of the pose x with the lengths l; the norm is that of the
+keypoint's covariance. From several headings, pose and lengths are fitted together. The prior of a
+length is its measurement or its spread over people; known gravity makes the pose upright, and a
+depth image gives depths of joints. The lengths are then fixed, the flips of all limbs that the
+image and the limits allow are enumerated and fitted again, and the best are the first mixture.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ from hmt_ros.tracking.settings import (
 )
 from hmt_ros.tracking.validity import UNDECIDED
 
-# Standard deviation of a measured stature, m: it has a skull and a heel that are not the model's.
+# Standard deviation of a measured stature, m: the model lacks the person's skull and heels.
 STATURE_SIGMA = 2.0 * MEASURED_SIGMA
 NO_POSE = 'no pose of the body explains the keypoints: are they in the image?'
 LEAST_SQUARES = TermSettings(1.0, 1.0, np.inf)
@@ -63,9 +62,9 @@ class Start:
 
     Attributes:
         body: of the person; its shape is estimated while the track lasts.
-        poses: (M, d) distinct poses, best first, or the means of
-        expected: a mixture over poses; None: all poses count the same.
-        clicked: keypoints that the start is fitted to, in place of those of the image.
+        poses: (M, d) distinct poses, best first, or the means of `expected`.
+        expected: mixture over poses; None: all poses have the same weight.
+        clicked: keypoints that replace those of the image in the fit of the start.
     """
 
     body: Body
@@ -91,11 +90,11 @@ def start_from_keypoints(
 
     Args:
         body: model of the person.
-        camera: that the joints were seen by.
+        camera: that saw the joints.
         subject: joints, and measurements of the person.
-        upright: gravity; None: unknown, and the root leans little against the camera's axes.
-        depths: of the image that the joints were seen in; None: unknown. They are not used where
-            they make a stature that people do not have, or do not show the surface of any pose.
+        upright: gravity; None: unknown, and the prior keeps the root near the camera's axes.
+        depths: of the image with the joints; None: unknown. They are dropped if they give an
+            impossible stature, or do not show the surface of the best pose.
 
     Raises:
         ValueError: joints from which no pose can be fitted.
@@ -133,7 +132,7 @@ def _with_flips(
     """Distinct poses (M, d) that explain joints, best first, from guesses (N, d) and their flips.
 
     Raises:
-        ValueError: there is none.
+        ValueError: no pose can be fitted.
     """
     least_squares = LikelihoodSettings.of_terms(keypoints=LEAST_SQUARES, depth=DEPTH.settings)
     settings = replace(least_squares, prior_weight=1.0)
@@ -164,7 +163,7 @@ def poses_from_keypoints(
 ) -> Array:
     """Poses (M, d) of a body of known lengths that explain the joints of an image, best first.
 
-    Depths that do not show the surface of any pose are not used.
+    Depths that do not show the surface of the best pose are not used.
 
     Raises:
         ValueError: joints from which no pose can be fitted.
@@ -180,7 +179,7 @@ def poses_from_keypoints(
 
 
 def poses_from_outline(body: Body, camera: Camera, outline: Outline) -> Array:
-    """Mean poses (HEADINGS, d) of all headings, as high and where the silhouette is."""
+    """Mean poses (HEADINGS, d) of all headings, at the place and height of the silhouette."""
     rays = _level_rays(body, camera, outline.pixels)
     return _poses_between(body, *np.quantile(rays, [0.02, 0.98], axis=0))
 
@@ -188,7 +187,8 @@ def poses_from_outline(body: Body, camera: Camera, outline: Outline) -> Array:
 def mixture_from_box(body: Body, camera: Camera, box: Box) -> GaussianMixture:
     """Mean poses of all headings in a box (left, top, right, bottom), px.
 
-    Limbs are as uncertain as the prior of the body says, the place by a share of the distance.
+    Limbs have the variances of the body's prior; the deviation of the place is a fraction of the
+    distance.
     """
     left, top, right, bottom = box
     middle = (0.5 * (left + right), 0.5 * (top + bottom))
@@ -206,10 +206,10 @@ def mixture_from_box(body: Body, camera: Camera, box: Box) -> GaussianMixture:
 
 
 def check_box(box: Box, camera: Camera) -> None:
-    """Checks a box (left, top, right, bottom) in which a person is to be, px.
+    """Checks the box (left, top, right, bottom) of a person, px.
 
     Raises:
-        ValueError: no finite numbers, a box without an area, or one beside the image.
+        ValueError: numbers that are not finite, a box without an area or outside the image.
     """
     left, top, right, bottom = box
     if not np.isfinite(box).all() or left >= right or top >= bottom:
@@ -243,7 +243,7 @@ def _poses_between(body: Body, low: Array, high: Array) -> Array:
 
 
 def _sized(body: Body, subject: Subject) -> Body:
-    """The body at the measured lengths of the person, with the uncertainty of its lengths."""
+    """The body with the measured lengths of the person, and their covariance."""
     if subject.stature is not None:
         body = body.with_stature(subject.stature)
     known = subject.segment_lengths
@@ -263,7 +263,7 @@ def _sized(body: Body, subject: Subject) -> Body:
 
 
 def _is_a_stature(body: Body, lengths: Array) -> bool:
-    """Whether lengths (L,) make a stature that people have."""
+    """Whether lengths (L,) give a plausible stature."""
     rates = body.stature_rates
     change = float(product(rates, lengths - body.skeleton.lengths))
     variance = float(product(product(rates, body.length_covariance), rates)) + STATURE_SIGMA**2
@@ -280,7 +280,7 @@ def _fit_with_lengths(
     """Fits (pose, lengths) to the joints from several headings; x is (HEADINGS, d + L)."""
     skeleton = body.skeleton
     d, count = body.dimension, len(skeleton.length_names)
-    # Slopes of bones that were lifted are weighed once the lengths are known.
+    # Lifted 3D positions are used only once the lengths are known.
     term = KeypointTerm(skeleton, camera, replace(keypoints, positions=None), LEAST_SQUARES)
     residuals = 2 * int(keypoints.seen.sum())
     sigma = body.length_sigma
@@ -368,7 +368,7 @@ def _first_guesses(
     upright: Gravity | None,
     measured: JointDepths,
 ) -> Array:
-    """Mean poses at several headings, at the joints, at the distance that their spread gives."""
+    """Mean poses at several headings, placed at the joints, at a distance given by their spread."""
     seen = keypoints.seen
     pixels = keypoints.pixels[seen]
     names = [x for x, ok in zip(keypoints.names, seen, strict=True) if ok]
@@ -377,7 +377,7 @@ def _first_guesses(
     pose = body.prior_mean.copy()
     pose[~body.skeleton.dof_is_rotation] = 0.0
     joints = body.joint_positions(pose[None])[0][body.skeleton.joint_index(names)]
-    # Size in space over size in the image; arms and heading blur it, the fit mends it.
+    # Depth = size in space over size in the image; the fit corrects errors by arms and heading.
     extent = np.linalg.norm(rays - rays.mean(0), axis=1).mean()
     spread = np.linalg.norm((joints - joints.mean(0))[:, :2], axis=1).mean()
     if not extent > 0:

@@ -1,9 +1,9 @@
 """Weights of the modes of an image, smoothed over the L images after it.
 
-They are those of forward filtering, backward smoothing (`inference.mode_chain`) in a window of the
-image and the L after it. The evidence of an image for mode k, or for the way that it faces
-(`classes`), is a factor of w_k alone. So the lagged weights agree with the published ones, which
-are those of L = 0: they are the sum over all histories of the modes. Where a mode stands for
+They result from forward filtering, backward smoothing (`inference.mode_chain`) in a window of the
+image and the L after it. The evidence of an image for mode k, or for its facing direction
+(`classes`), is a factor of w_k alone. So the lagged weights are consistent with the published ones,
+which are those of L = 0: they are sums over all histories of the modes. If a mode represents
 several hypotheses, P is their mean (`weighting.pooled_origins`).
 """
 
@@ -22,8 +22,7 @@ class Lagged(NamedTuple):
 
     Attributes:
         stamp: of the image, ns.
-        posterior: of the image; its components are in the order in which it was published, their
-            weights are the lagged ones.
+        posterior: of the image, with lagged weights; components are in the published order.
     """
 
     stamp: int
@@ -41,7 +40,7 @@ class LaggedWeights:
         found += lagged.finish()
 
     Args:
-        lag: number of images, L; 0 gives back the published posteriors.
+        lag: number of images, L; 0 returns the published posteriors.
 
     Raises:
         ValueError: the lag is negative.
@@ -51,21 +50,21 @@ class LaggedWeights:
         if lag < 0:
             raise ValueError(f'lag must not be negative, saw {lag}')
         self.lag = lag
-        # Posteriors without a result, with the origins of each in the one before; L + 1 at most.
+        # At most L + 1 posteriors without a result, with their origins in the previous one.
         self._waiting: list[tuple[Lagged, Array]] = []
 
     def update(self, stamp: int, posterior: GaussianMixture, origins: Array) -> list[Lagged]:
-        """Takes in the posterior of the next image.
+        """Adds the posterior of the next image.
 
         Args:
             stamp: of the image, ns.
             posterior: K components.
-            origins: (K, M) probability that each continues component m of the image before; M is 0
-                where a track begins.
+            origins: (K, M) probability that each continues component m of the previous image; M is
+                0 where a track starts.
 
         Returns:
-            The image L before this one, if it is of the same track; where a track begins, all that
-            were left of the one before. Oldest first.
+            The image L before this one, if it is of the same track; where a track starts, all
+            remaining images of the previous one. Oldest first.
 
         Raises:
             ValueError: origins of another shape.
@@ -82,12 +81,12 @@ class LaggedWeights:
         return result
 
     def finish(self) -> list[Lagged]:
-        """The images that are left; fewer than L images weigh these."""
+        """The remaining images, weighted by fewer than L later ones."""
         result, self._waiting = self._smoothed(), []
         return result
 
     def _smoothed(self) -> list[Lagged]:
-        """The waiting images by all that follow them."""
+        """The waiting images, each weighted by all later ones."""
         if not self._waiting:
             return []
         links = [Link(one.posterior.weights, origins) for one, origins in self._waiting]

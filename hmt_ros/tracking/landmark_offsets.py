@@ -1,11 +1,11 @@
-"""Where the landmarks of one person lie, learned while the image says where the person is.
+"""Places of the landmarks of one person, learned while other cues show where the person is.
 
     pixel_l = project(J_l + R_l (o_l + d_l)) + e,     d_l ~ N(0, PRIOR^2)
 
-o_l is the usual offset of landmark l in the frame of its segment R_l, d_l what this person, these
-clothes and this detector add. A keypoint errs by much the same for seconds, so that images count at
-most `RATE` a second. Keypoints alone can not tell an offset from a pose: edges or silhouettes must
-be evidence, too.
+o_l is the usual offset of landmark l in the frame of its segment R_l, d_l the addition by this
+person, these clothes and this detector. Errors of a keypoint persist for seconds, so at most `RATE`
+images a second count. Keypoints alone can not distinguish an offset from a pose: edges or
+silhouettes must be evidence, too.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import product, solve
 
-# Standard deviation of an offset of a person, and of a keypoint at the person, m.
+# Standard deviations of an offset d_l, and of the error of a keypoint at the person, m.
 PRIOR, SIGMA = 0.02, 0.03
-# Scale of the kernel of robust errors, m; least confidence; images that count, per second.
+# Scale of the robust kernel, m; least confidence of a keypoint; effective images per second.
 KERNEL, LEAST_CONFIDENCE, RATE = 0.06, 0.5, 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class LandmarkOffsets:
-    """What has been learned of the landmarks of a person.
+    """Estimate of the offsets of a person's landmarks.
 
     Attributes:
-        landmarks: names of n landmarks; empty: nothing is known.
+        landmarks: names of n landmarks; empty if unknown.
         precision: (n, 3, 3) information on the offsets, 1/m^2.
-        pull: (n, 3) the same times the offsets, 1/m.
+        pull: (n, 3) information times offsets, 1/m.
     """
 
     landmarks: tuple[str, ...] = ()
@@ -48,7 +48,7 @@ class LandmarkOffsets:
         return np.asarray(solve(known, self.pull[..., None])[..., 0])
 
     def applied(self, keypoints: Keypoints | None) -> Keypoints | None:
-        """Keypoints of the landmarks where this person has them."""
+        """Keypoints with the offsets of this person."""
         if keypoints is None or keypoints.offsets is None or keypoints.landmarks != self.landmarks:
             return keypoints
         return replace(keypoints, offsets=keypoints.offsets + self.offsets)
@@ -56,12 +56,12 @@ class LandmarkOffsets:
     def after(
         self, keypoints: Keypoints, body: Body, camera: Camera, pose: Array, dt: float
     ) -> LandmarkOffsets:
-        """What is known after an image.
+        """The estimate after an image.
 
         Args:
-            keypoints: of the image, as `applied` gave them.
-            body, pose: the person, (d,), as all cues show it.
-            dt: since the image before, s.
+            keypoints: of the image, returned by `applied`.
+            body, pose: the person at the pose (d,) by all cues.
+            dt: time since the previous image, s.
         """
         if keypoints.landmarks is None or keypoints.offsets is None:
             return self

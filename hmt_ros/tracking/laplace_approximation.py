@@ -1,17 +1,17 @@
 """Gaussians around optima: the modes of the posterior, and those of the likelihood alone.
 
-    filtered     H^-1                                      as if errors did not last
+    filtered     H^-1                                      as if errors were independent
     covariance   T (H_prior + sum_g a_g(dt) H_g)^-1 + J P J'               g: image, keypoints
-    state        N(pose, velocity) conditioned on where the pose was found; see `motion_states`
+    state        N(pose, velocity) conditioned on the found pose; see `motion_states`
 
 H is the Gauss-Newton Hessian of the energy at an optimum, H_prior that of body and ground, without
-the motion prior. Errors last, so a cue counts with its share a_g, and all images so far leave T
-times the covariance that one leaves by itself (`inference.error_model`). Uncertainty of the shape
-makes the pose uncertain: J P J' (`shape_estimation`). A variable on its limit hardly varies.
+the motion prior. Errors persist, so a cue counts with its share a_g, and the covariance given all
+images so far is T times that given one (`inference.error_model`). Uncertainty of the shape makes
+the pose uncertain: J P J' (`shape_estimation`). A variable on its limit hardly varies.
 
-The likelihood alone is passed on undiscounted, together with the duration of its errors: the
+The likelihood alone is published undiscounted, together with the duration of its errors: the
 consumer that combines images discounts them once. The error due to the shape is the same in all
-images; its covariance is passed on beside the likelihood.
+images; its covariance is published beside the likelihood.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from hmt_ros.tracking.settings import MAX_MODE_SHIFT
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
 from hmt_ros.tracking.weighting import at_least, normalised
 
-# Smallest log weight of a mode of a likelihood, nats: its exponential is a number still.
+# Smallest log weight of a mode of a likelihood, nats, whose exponential does not underflow.
 MIN_LOG_WEIGHT = elementary.log(np.finfo(np.float64).tiny)
 
 
@@ -49,18 +49,18 @@ class Likelihood:
     """The likelihood of an image as a function of the pose, undiscounted.
 
     Attributes:
-        mixture: exp(-E) up to a factor, E the energy of the image: whole curvature as covariances,
-            weights exp(-E) |S|^(1/2); heaviest mode first.
-        values: (K,) log likelihoods of the image at its means, nats.
-        errors: how its errors last, all cues together.
+        mixture: exp(-E) up to a factor, E the energy of the image: covariances S by the whole
+            curvature, weights exp(-E) |S|^(1/2); heaviest mode first.
+        values: (K,) log likelihoods of the image at the means, nats.
+        errors: duration of its errors, all cues together.
         shape_covariance: (d, d) J P J' at the heaviest mode of the posterior.
-        modes: (K,) of the posterior, in the order of the components, which are about one each.
+        modes: (K,) row of the posterior mode that each component belongs to.
         posterior_weights: (K,) of these modes, given all images so far; they sum to 1.
         identities: (K,) of these modes, see `Identities`.
-        origins: (K, M) probability that each continues component m of the likelihood of the image
-            before; M is 0 where the modes begin. See `LaggedWeights`.
+        origins: (K, M) probability that each continues component m of the likelihood of the
+            previous image; M is 0 at a start. See `LaggedWeights`.
         ancestors: (M,) identities of those components.
-        ancestry_stamp: of the image before, ns; None: the modes begin.
+        ancestry_stamp: of the previous image, ns; None: the track starts.
     """
 
     mixture: GaussianMixture
@@ -91,13 +91,13 @@ def posterior_modes(
     Args:
         selected: K hypotheses at their optima, heaviest first.
         log_weights: (K,) normalised.
-        origins: (K, M) probability that each comes from mode m of the image before.
+        origins: (K, M) probability that each continues mode m of the previous image.
         posterior: of the image.
         observation: of the image.
-        shape: of the person, as far as it is known.
-        dynamics: how modes move by themselves.
-        states: of the ancestors, predicted; None: the modes begin, at rest.
-        dt: time since the image before, s; infinite: there is none.
+        shape: present estimate of the person's shape.
+        dynamics: motion prior of the modes.
+        states: predicted states of the ancestors; None: the track starts, at rest.
+        dt: time since the previous image, s; infinite at a start.
     """
     h, solved = selected.hypotheses, selected.minima
     poses = solved.x
@@ -116,7 +116,7 @@ def posterior_modes(
     else:
         found = filtered
         if states.wandered.any() and measured:
-            # Errors of images last: the propagated covariance uses a share of them, too.
+            # Errors of images persist, so the propagated covariance uses their share, too.
             found = fused(states.covariances_of(h.ancestors, h.jumped), alone)
         velocities, state_covariances = states.given(h.ancestors, h.jumped, poses, found)
     return replace(
@@ -142,19 +142,19 @@ def likelihood_modes(
     shape: ShapeEstimate,
     before: tuple[int | None, Likelihood],
 ) -> Likelihood:
-    """The modes of the likelihood alone, without information from the images before.
+    """The modes of the likelihood alone, without information from previous images.
 
-    Around each mode of the posterior the energy of the image and of the body's prior is a
-    parabola; its minimum and curvature make a component, its depth and its volume the weight, of at
-    least `MIN_LOG_WEIGHT`. Nothing is discounted, except that one pair (s, tau) stands for
-    keypoints and experts: their information per second is the same as in the filter.
+    Around each mode of the posterior the energy of the image and of the body's prior is
+    approximately quadratic. Its minimum and curvature give a component, its depth and volume the
+    weight, of at least `MIN_LOG_WEIGHT`. Nothing is discounted, except that one pair (s, tau)
+    describes keypoints and experts, with the same information per second as in the filter.
 
     Args:
         modes: of the posterior, K, heaviest first.
         posterior: of the image.
         observation: of the image.
-        shape: of the person, as far as it is known.
-        before: stamp, ns, and likelihood of the image before; without meaning where modes begin.
+        shape: present estimate of the person's shape.
+        before: stamp, ns, and likelihood of the previous image; unused at a start.
     """
     body, poses = posterior.body, modes.poses
     fit = posterior.fit(poses, observation, LIFTED_AS_KEYPOINTS)
@@ -190,9 +190,9 @@ def likelihood_modes(
 
 
 def _errors(fit: ImageFit, weights: Array) -> CueErrors:
-    """How long errors of an energy last; its Hessian H = sum_g H_g has the inverse S in a mode.
+    """Duration of the errors of an energy with the Hessian H = sum_g H_g, of inverse S, at a mode.
 
-    A cue counts with the number of variables that it determines, tr(S H_g), in the mean over modes.
+    A cue counts with the number of variables that it determines, tr(S H_g), averaged over modes.
     """
     amounts = np.empty(3)
     determined(weights, fit.covariances, fit.hessians, amounts)

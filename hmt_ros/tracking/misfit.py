@@ -3,11 +3,11 @@
     silhouette   visible points of the model outside it
     outline      samples of the silhouette's outline further than `GATE_SIGMAS` from the model's
     keypoints    those of a group further than `GATE_SIGMAS` from their landmarks
-    depth        energy of the visible surface, as a share of the largest that there is
+    depth        energy of the visible surface, as a share of the largest possible
 
-Clothes in the colours of the scene are no foreground where the person is, nor is the person in the
-mask of another image. A depth image that is late or not registered shows the background where the
-model has limbs, so that most points cost what their kernel allows, whatever the pose.
+Clothes in the colours of the scene are not foreground, nor is the person in a mask of another
+image. A depth image that is late or not registered shows the background where the model has limbs,
+so that most points have the maximum cost of their kernel at any pose.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class Misfit(NamedTuple):
     """Share of a cue that is not explained, by group.
 
     Attributes:
-        shares: (G,) from 0, all is explained, to 1.
-        counts: (G,) number of measurements; 0: nothing is known.
+        shares: (G,) unexplained, from 0 to 1.
+        counts: (G,) number of measurements; 0: unknown.
     """
 
     shares: Array
@@ -48,7 +48,7 @@ class Misfit(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Share over all measurements together; 0 where there are none."""
+        """Share over all measurements together; 0 without any."""
         return float((self.shares * self.counts).sum() / max(self.counts.sum(), 1.0))
 
 
@@ -63,12 +63,12 @@ def of_silhouette(
 ) -> dict[str, Misfit]:
     """Misfits of a silhouette and of its outline, given modes.
 
-    There are none without a silhouette. An empty silhouette has no misfit of points, unless
-    keypoints place somebody.
+    Empty without a silhouette. An empty silhouette has no misfit of points, unless there are
+    keypoints.
 
     Args:
         body, camera, poses: the modes (K, d), heaviest first.
-        observation: of the image; its outline counts even where the likelihood leaves it out.
+        observation: of the image; its outline counts even if the likelihood does not use it.
         term: settings of the energies of the samples.
         costs: (K, M) of these samples in the likelihood.
         points: visible points of the modes, if they are known.
@@ -88,11 +88,11 @@ def of_silhouette(
 
 
 def of_points(points: SurfacePoints, row: int, foreground: Mask) -> Misfit:
-    """Visible points of a mode that are no foreground.
+    """Share of the visible points of a mode that are not foreground.
 
     Args:
         points: visible points of the modes.
-        row: number of the chosen mode.
+        row: of the mode.
         foreground: (H, W).
     """
     n = int(points.counts[row])
@@ -125,7 +125,7 @@ def outline_costs(
     """Energies (K, M) of samples of the outline of a silhouette at poses (K, d).
 
     Args:
-        body, camera, poses: that it is compared with.
+        body, camera, poses: that the silhouette is compared with.
         foreground: (H, W), which the likelihood does not use.
         term: settings of the energies.
     """
@@ -138,9 +138,9 @@ def outline_costs(
 
 
 def of_keypoints(term: KeypointTerm, poses: Array) -> Misfit:
-    """Keypoints that the best of poses (K, d) does not explain, by group.
+    """Share of the keypoints that the best of poses (K, d) does not explain, by group.
 
-    Each pose is given the exchange of sides that is likeliest there.
+    Each pose uses its most likely exchange of sides.
     """
     groups = term.measured.points.groups
     count = EXCHANGED.shape[1]
@@ -154,7 +154,7 @@ def of_keypoints(term: KeypointTerm, poses: Array) -> Misfit:
 
 
 def of_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap) -> Array:
-    """Share of the visible surface (N,) that poses (N, d) have elsewhere than depths show it."""
+    """Share (N,) of the visible surface of poses (N, d) that disagrees with depths."""
     likelihood = ImageLikelihood(body, camera, LikelihoodSettings.of_terms(depth=DEPTH.settings))
     seen = Observation(evidence={DEPTH.name: depths})
     image = PoseEnergy(likelihood, (ObservedImage(likelihood, seen),))
@@ -165,7 +165,7 @@ def of_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap) -> Arra
 
 
 def of_depth_at_best(body: Body, camera: Camera, pose: Array, depths: ImageMap) -> float:
-    """The same for one pose (d,), or for the pose moved to the measured depth.
+    """The smaller share of a pose (d,) and of this pose moved to the measured depth.
 
     A track that used no depth may be at a wrong distance.
     """

@@ -1,10 +1,10 @@
-"""Inputs of a tracker from an image: a view of anybody who is there, and evidence on the person.
+"""Inputs of a tracker from an image: a view of any person, and the evidence about the person.
 
     view          silhouettes near the person and anywhere, keypoints     before a pose is known
-    observation   evidence of every term of the likelihood that counts    near a pose
+    observation   evidence of every term of the likelihood in use         near a pose
 
-Existence and starts are decided from the view. The observation is made from it once it is known
-where the person is and whether the silhouettes of this track are believed.
+Existence and starts are decided from the view. The observation is made from it once the place of
+the person and the validity of the silhouettes are known.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ from hmt_ros.tracking.validity import Validity
 
 
 class View(NamedTuple):
-    """The view of a person in an image, before a pose is known, and what was given with the image.
+    """An image with its inputs, and the view of a person in it before a pose is known.
 
     Attributes:
         image: (H, W, 3) BGR.
         stamp: of the image, ns.
-        keypoints: of a detector; without any that was seen: it saw nobody. None: it has not
-            answered, or there is none.
+        keypoints: of a detector, which saw nobody if no keypoint is seen; None: no detector, or no
+            answer.
         prediction: pose hypotheses from an external predictor, if any.
         mask: (H, W) of a segmenter; None: unknown.
-        predicted: whether a predictor expects somebody by this image; None: it has not answered, or
-            there is none.
-        others: (H, W) pixels that somebody else covers; None: none.
+        predicted: whether a predictor found a person in this image; None: no predictor, or no
+            answer.
+        others: (H, W) pixels that other people cover; None: no such pixels.
         depth: (H, W) depth along the axis of the camera, m; None: unknown.
-        silhouette: (H, W) foreground near the person, all false where there is none; None: there is
-            no background.
-        anywhere: (h, w) all of the foreground of the image, on a coarser raster; None: there is no
-            background.
+        silhouette: (H, W) foreground near the person, may be empty; None: neither background nor
+            mask.
+        anywhere: (h, w) all foreground of the image, on a coarser raster; None: as for
+            `silhouette`.
         changed: share of the pixels that differ from the background.
-        unsure: (H, W) pixels of the person or of a shadow; None: none.
-        hidden: (S,) segments that something else covers; None: none.
+        unsure: (H, W) pixels of the person or of a shadow; None: no such pixels.
+        hidden: (S,) segments that something else covers; None: no such segments.
     """
 
     image: Image
@@ -73,11 +73,11 @@ class Observer:
 
     Args:
         camera: that takes the images.
-        settings: of the tracker; terms of weight 0 need nothing.
-        silhouettes: where those of the images come from.
+        settings: of the tracker; terms of weight 0 get no evidence.
+        silhouettes: source of the silhouettes.
 
     Attributes:
-        last_image: (H, W, 3) that the optical flow starts from; None: there is no flow.
+        last_image: (H, W, 3) that the optical flow starts from; None: no flow.
     """
 
     def __init__(self, camera: Camera, settings: TrackerSettings, silhouettes: Silhouettes) -> None:
@@ -91,8 +91,8 @@ class Observer:
 
         Args:
             given: the image with its inputs.
-            body: that a prediction has to be of.
-            last: stamp of the image before, ns; None: there was none.
+            body: whose degrees of freedom a prediction must have.
+            last: stamp of the previous image, ns; None: first image.
 
         Raises:
             ValueError: an array that does not have the size of the camera's images, a stamp that
@@ -118,7 +118,7 @@ class Observer:
         Args:
             given: the image with its inputs, without silhouettes.
             body: of the person.
-            poses: (K, d) in an image before; None: the person may be anywhere.
+            poses: (K, d) in an earlier image; None: the person may be anywhere.
             dt: time since that image, s.
         """
         if self._settings.likelihood.coverage.weight == 0:
@@ -141,7 +141,7 @@ class Observer:
 
         Args:
             view: of the image.
-            pose: (d,) that the person is about at; None: unknown.
+            pose: (d,) approximate; None: unknown.
             validity: of the cues; those that more likely show something else are left out.
         """
         likelihood = self._settings.likelihood

@@ -2,14 +2,14 @@
 
 x_k = argmin E(x)          bounded Newton from x_k^0, within the joint limits
 
-An image that moves the modes far, as when people move fast, gets more evaluations: it is surprising
-where
+An image that moves the modes far, for example in fast motion, gets more evaluations. It is
+surprising if
 
     m' P m  >  `SURPRISING_RATIO` E m' P m  =  `SURPRISING_RATIO` tr(I - P H^-1)
 
-m leads from the prediction of the heaviest mode, which has the precision P, to its optimum, where
-the energy has the Hessian H; so the covariance of m is P^-1 - H^-1. The usual distance grows with
-the information in the image, so with the time between two images.
+m is the vector from the prediction of the heaviest mode, with the precision P, to its optimum, with
+the Hessian H of the energy; so the covariance of m is P^-1 - H^-1. Its expected size grows with the
+information in the image, and so with the time between two images.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ class Search:
     Attributes:
         posterior: whose energy is minimised.
         observation: of the image.
-        states: of the modes of the image before, predicted.
+        states: predicted states of the previous modes.
         precisions: (K, d, d) inverse covariances of their poses.
-        continuity: with the modes of the image before.
+        continuity: transition densities from the previous modes.
         plan: allocation of the evaluations of the image.
-        modes: of the image before.
+        modes: of the previous image.
         prediction: pose hypotheses from an external predictor, if any.
-        base: optima of the image, one for each mode, then that of the pose by keypoints, if any.
+        base: optima in the image, one for each mode, then that of the pose by keypoints, if any.
     """
 
     posterior: Posterior
@@ -60,7 +60,7 @@ class Search:
 
     @property
     def dt(self) -> float:
-        """Time since the image before, s."""
+        """Time since the previous image, s."""
         return self.continuity.dt
 
     @cached_property
@@ -70,14 +70,14 @@ class Search:
 
     @cached_property
     def base_rated(self) -> Array:
-        """About the log weights (K,) that the optima would have."""
+        """Approximate log weights (K,) of the optima."""
         return self._rated(self.base_joints, self.base.value)
 
     def _rated(self, joints: Array, energies: Array) -> Array:
         return self.continuity.rated(joints) - ERRORS['image'].share(self.dt) * energies
 
     def best(self, poses: Array, energies: Array) -> Index:
-        """Rows of poses (N, d) of these energies (N,) that stand for all, as many as candidates."""
+        """Rows of representative poses among (N, d) with energies (N,), at most `candidates`."""
         joints = self.posterior.body.joint_positions(poses)
         return choose_hypotheses(
             joints - joints[:, :1],
@@ -89,20 +89,20 @@ class Search:
     def optimise(self, hypotheses: Hypotheses) -> Optimised:
         """Hypotheses (N, d) at their optima."""
         posterior = self.posterior
-        # Each has a precision of its own, where it jumped a lower one.
+        # The precision of variables that jumped is lower.
         own = self.states.precisions_of(hypotheses.ancestors, hypotheses.jumped, self.precisions)
         term = posterior.given(self.observation, hypotheses.expected, own, hypotheses.exchanges)
         solved = posterior.minimise(term, hypotheses.poses, self.plan.iterations)
         return Optimised(hypotheses, solved)
 
     def evidence(self, optimised: Optimised) -> Array:
-        """Energies (N,) that the image adds to minus the log weights, nats."""
+        """Energies (N,) of the image that reduce the log weights, nats."""
         exchanges = optimised.hypotheses.exchanges
         return self.posterior.evidence(optimised.minima.x, self.observation, exchanges, self.dt)
 
 
 def is_surprising(moved: Array, precision: Array, hessian: Array) -> bool:
-    """Whether an image has moved a mode far for its information; never where it has none.
+    """Whether an image has moved a mode far, relative to its information.
 
     Args:
         moved: (d,) from the prediction of the mode to its optimum.

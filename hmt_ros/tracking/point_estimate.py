@@ -4,15 +4,15 @@
 
 with joints p_j relative to the pelvis. This is the pose of least expected distance: where modes
 disagree it is a median, which few wrong modes hardly move, and where they agree a mean, which
-trembles less than each of them. By reweighted least squares, from the weighted mean of the poses
-[Weiszfeld 1937]:
+has less jitter than each of them. It is found by reweighted least squares, from the weighted mean
+of the poses [Weiszfeld 1937]:
 
     s_kj = w_k / max(|p_j - p_kj|, e),   S_j = sum_k s_kj,   t_j = sum_k s_kj p_kj / S_j         (2)
     x <- x + (sum_j S_j (P_j' P_j + l^2))^-1 sum_j S_j P_j' (t_j - p_j),   P_j = dp_j / dx       (3)
 
-The place of the pelvis is the weighted mean, and so is whatever moves no joint. Modes that face the
-other way are left out, because nobody holds the mean of two opposite poses. Other images have no
-part in it: the modes are filtered, and a second filter would lag.
+The place of the pelvis is the weighted mean, and so is every variable that moves no joint. Modes
+that face the other way are left out, because the mean of two opposite poses is no human pose. Other
+images are not used: the modes are filtered, and a second filter would lag.
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.inference.linear_algebra import product, solve
 from hmt_ros.inference.mixture import GaussianMixture
 
-# Steps (3): more hardly change it. Chosen by accuracy on tracked clips, as is the next number.
+# Number of steps (3): more hardly change the result. Chosen by accuracy on tracked clips.
 STEPS = 2
-# Distance e of joints below which modes agree, m: they tremble by as much. Chosen.
+# Distance e of joints below which modes agree, m: the size of their jitter. Chosen by accuracy on
+# tracked clips.
 AGREED = 0.03
-# Lever l of the joints about an axis, m, below which its angle stays that of the mean. Chosen.
+# Lever l of the joints about an axis below which its angle stays that of the mean, m. Chosen.
 LEVER = 0.01
 
 
@@ -55,7 +56,7 @@ def point_estimate(body: Body, posterior: GaussianMixture) -> Array:
 
 
 def _facing_alike(body: Body, posterior: GaussianMixture) -> Mask:
-    """The components (K,) that face the way of more weight: at most 90 degrees from each other."""
+    """The components (K,) that face the likelier way, within 90 degrees of its heaviest one."""
     weights = posterior.weights
     if not body.trunk_pairs:
         return np.ones(len(weights), dtype=np.bool_)
@@ -80,7 +81,7 @@ def _step(body: Body, pose: Array, places: Array, weights: Array) -> Array:
 
 
 def _differences(body: Body, poses: Array, reference: Array) -> Array:
-    """Poses (N, d) minus a reference pose (d,), rotations of the root the short way round."""
+    """Poses (N, d) minus a reference pose (d,), with root rotations in [-pi, pi)."""
     result = poses - reference
     root = root_rotation_dofs(body.skeleton)
     result[:, root] = (result[:, root] + np.pi) % (2.0 * np.pi) - np.pi

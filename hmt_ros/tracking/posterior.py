@@ -1,11 +1,10 @@
-"""The energy of a pose given one image and where it was expected (KJS 2).
+"""The energy of a pose given one image and the expected pose (KJS 2).
 
     E(x) = E_image(x) + E_keypoints(x) + E_prior(x) + E_intersection(x) + E_motion(x)
            + E_ground(x) + E_extra(x)
 
-E_motion is a Gaussian around the expected pose.
-E_ground are the terms of gravity, floor and feet (`body.ground_terms`), E_extra are terms that the
-user of a tracker adds.
+E_motion is the energy of a Gaussian around the expected pose. E_ground are the terms of gravity,
+floor and feet (`body.ground_terms`), E_extra terms that the user of a tracker adds.
 """
 
 from __future__ import annotations
@@ -32,9 +31,9 @@ from hmt_ros.tracking.classes import known_exchanges
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.settings import LIMIT_SIGMA, MAX_SIGMA, MINIMUM_TOLERANCE, TrackerSettings
 
-# Share of Hessians that are no sums.
+# Share of a Hessian that is not split by cue.
 ALONE = np.ones(1)
-# Precisions of a variable that rests on a limit, and of one that nothing is known of.
+# Precisions of a variable that rests on a limit, and of an unknown variable.
 PRECISIONS = 1.0 / LIMIT_SIGMA**2, 1.0 / MAX_SIGMA**2
 
 
@@ -43,11 +42,11 @@ class ImageFit:
     """Fit of poses (K, d) to an image, without the motion prior.
 
     Attributes:
-        energy: with the priors of the body.
+        energy: of all terms, the priors of the body included.
         image_energy: (K,) of the image and the keypoints alone.
-        hessians: (K, 3, d, d) of the image terms, of the keypoints, and of all else.
+        hessians: (K, 3, d, d) of the image terms, of the keypoints, and of all other terms.
         outline_costs: (K, M) of the samples of the silhouette's outline.
-        free: (K, d) variables that do not rest on a limit, where only the image moves them.
+        free: (K, d) variables that do not rest on a limit.
         covariances: (K, d, d) inverse Hessians of the energy on these; see `free_covariances`.
         log_determinants: (K,) of the covariances.
     """
@@ -62,21 +61,20 @@ class ImageFit:
 
     @cached_property
     def given_way(self) -> tuple[Array, Array]:
-        """Response of the poses to other changes.
+        """Gradients (K, d) and inverse Hessians (K, d, d) of the energy on the free variables.
 
-        Gradients (K, d) of the energy of the image and of the prior of the body, 0 for variables
-        that rest on a limit, and inverse Hessians (K, d, d), in which they do not move.
+        Both are 0 for variables that rest on a limit.
         """
         gradient = self.energy.derivatives()[0]
         moving = self.free[:, :, None] & self.free[:, None, :]
         return gradient * self.free, self.covariances * moving
 
     def lasting(self, free: Mask, dt: float) -> Array:
-        """Covariances (K, d, d) that an image alone leaves, whose errors last.
+        """Covariances (K, d, d) given one image alone, with persistent errors.
 
         Args:
             free: (K, d) variables that do not rest on a limit.
-            dt: time since the image before, s.
+            dt: time since the previous image, s.
         """
         shares = np.array([ERRORS['image'].share(dt), ERRORS['keypoints'].share(dt), 1.0])
         return free_covariances(self.hessians, free, shares)[0]
@@ -90,11 +88,12 @@ class Posterior:
         settings: of the tracker.
         extra: further terms.
         ground: gravity and floor; None: not used.
-        spent: takes the numbers of evaluations of the likelihood; None: a new list.
+        spent: list that receives the numbers of evaluations of the likelihood; None: a new list.
 
     Attributes:
-        person: the body with its lean; `body` has none where the ground tells of it.
-        body, camera, settings, extra, ground, spent: as above.
+        person: the body, with its prior of the root's lean.
+        body: the same without that prior if the ground terms replace it.
+        camera, settings, extra, ground, spent: as above.
     """
 
     def __init__(
@@ -124,7 +123,7 @@ class Posterior:
 
     @cached_property
     def divided(self) -> dict[str, tuple[ImageLikelihood, ImageLikelihood]]:
-        """By limb the likelihoods of its flesh, and of the rest of the body without it."""
+        """By limb the likelihoods of its flesh, and of the rest of the body."""
         chains, parts = self.body.skeleton.chains, self.body.flesh.parts
         result = {}
         for chain in (chain for pair in self.body.chain_pairs for chain in pair):
@@ -140,13 +139,13 @@ class Posterior:
         exchanges: Array | None = None,
         motion: Quadratic | None = None,
     ) -> PoseEnergy:
-        """The energy; its evaluations are counted.
+        """The energy, which counts its evaluations.
 
         Args:
             observation: of the image.
-            exchanges: log probabilities (N, E) of exchanges of sides before it, NaN where they are
-                unknown; None: all are.
-            motion: prior of the motion; None: without it.
+            exchanges: log probabilities (N, E) of exchanges of sides before the image, NaN where
+                unknown; None: all unknown.
+            motion: motion prior; None: no motion prior.
         """
         terms = self._terms(observation, exchanges)
         return PoseEnergy(self.likelihood, terms, motion, counted=self.spent.append)
@@ -168,7 +167,7 @@ class Posterior:
         return (*seen, *self.likelihood.priors, *self.known(observation))
 
     def known(self, observation: Observation) -> tuple[FrameTerm | GroundTerm, ...]:
-        """Terms besides those of image and body: those that were added, gravity and floor."""
+        """Terms besides those of image and body: the extra terms, gravity and floor."""
         if self.ground is None:
             return self.extra
         plane, last = self.ground.plane, self._ground_term
@@ -187,13 +186,13 @@ class Posterior:
         precisions: Array,
         exchanges: Array | None = None,
     ) -> PoseEnergy:
-        """With a Gaussian prior of precisions (N, d, d) around centres (N, d)."""
+        """The energy with a Gaussian prior of precisions (N, d, d) around centres (N, d)."""
         return self.of_image(observation, exchanges, Quadratic(centres, precisions))
 
     def placing(self, observation: Observation) -> PoseEnergy | None:
-        """The prior and the squares of the distances from keypoints; None: there are none.
+        """The energy of prior and squared distances to keypoints; None without keypoints.
 
-        A limb or a person far from the keypoints is not drawn to them by a robust kernel.
+        A robust kernel would not draw a limb or a person that is far from the keypoints.
         """
         if observation.keypoints is None or self.settings.likelihood.keypoints.weight == 0:
             return None
@@ -236,16 +235,16 @@ class Posterior:
     def evidence(
         self, poses: Array, observation: Observation, exchanges: Array, dt: float
     ) -> Array:
-        """Energies (N,), nats, that an image adds to minus the log weights of poses (N, d).
+        """Energies (N,) of an image, nats, that reduce the log weights of poses (N, d).
 
-        The exchange of sides is a chain (`classes`): its prior counts whole, the energies by their
-        share.
+        The exchange of sides is a chain (`classes`): its prior counts fully, the energies by their
+        shares.
 
         Args:
             poses: (N, d).
             observation: of the image.
-            exchanges: (N, E) log probabilities of exchanges of sides, NaN where they are unknown.
-            dt: time since the image before, s.
+            exchanges: (N, E) log probabilities of exchanges of sides, NaN where unknown.
+            dt: time since the previous image, s.
         """
         self.spent.append(len(poses))
         share = {name: errors.share(dt) for name, errors in ERRORS.items()}
@@ -262,7 +261,7 @@ def step_scale(body: Body) -> Array:
 def free_covariances(hessians: Array, free: Mask, shares: Array = ALONE) -> tuple[Array, Array]:
     """Inverses (K, d, d) of sums of Hessians on the free variables, and log determinants (K,).
 
-    A variable at its limit has the deviation `LIMIT_SIGMA`, and none one above `MAX_SIGMA`.
+    A variable at its limit has the deviation `LIMIT_SIGMA`; no deviation exceeds `MAX_SIGMA`.
 
     Args:
         hessians: (K, C, d, d), one of each cue.

@@ -1,4 +1,4 @@
-"""Predict: where hypotheses are expected in the next image (KJS figure 4, step 1).
+"""Predict: the expected hypotheses in the next image (KJS figure 4, step 1).
 
     (x, v)_{t+1} ~ N(A (x, v)_t, A S_t A' + Q)
 
@@ -42,7 +42,7 @@ def predict(
 
     Args:
         modes: that were selected in the last image.
-        body: with the limits, and with the rates by which jumps may miss.
+        body: with the limits, and the rates of variables that jump.
         dynamics: of the modes.
         dt: time since the last image, s.
     """
@@ -65,10 +65,10 @@ def predicted_states(
 
 @dataclass(frozen=True, eq=False)
 class Forecaster:
-    """Predicts a track from one image on; nothing in it changes, so that any thread may ask.
+    """Predicts a track from one image on; immutable, so any thread may use it.
 
     Attributes:
-        modes: of that image, as they were published.
+        modes: published modes of that image.
         body: with the limits.
         motion: the setting.
         stamp_ns: of the image.
@@ -80,7 +80,7 @@ class Forecaster:
     stamp_ns: int
 
     def at(self, stamp_ns: int) -> GaussianMixture:
-        """The mixture over poses at a time until which nothing is seen.
+        """The mixture over poses at a later time, without any image in between.
 
         Raises:
             ValueError: the time is before the image.
@@ -112,7 +112,7 @@ def follow_flow(
     Args:
         predicted: K of them.
         precisions: (K, d, d) of the predictions.
-        points: visible points of each mode in the last image; None: none were looked for.
+        points: visible points of each mode in the last image; None: unknown.
         observation: of the image.
         posterior: of the body.
     """

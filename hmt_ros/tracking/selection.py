@@ -1,11 +1,11 @@
-"""Select: which of many hypotheses to keep, few that stand for all (KJS figure 4, step 5).
+"""Select: few hypotheses that represent all (KJS figure 4, step 5).
 
     min over S, |S| = K:   sum_i w_i min_{s in S} d(i, s)
 
-Keeping the K heaviest modes keeps near copies of the heaviest one. Here the K are chosen that leave
-the least expected distance from a hypothesis to the nearest kept one, greedily, heaviest first; d
-is the mean distance of the joints, each capped; two hypotheses count as the same below a minimum.
-Those dropped give their weight to the nearest kept one.
+The K heaviest modes would be near copies of the heaviest one. Instead, K hypotheses are chosen
+greedily, heaviest first, to minimise the expected distance from a hypothesis to the nearest kept
+one; d is the mean distance of the joints, each capped; two hypotheses closer than a minimum count
+as one. A dropped hypothesis gives its weight to the nearest kept one.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from hmt_ros.tracking.settings import MAX_JOINT_DISTANCE
 
 
 class Kept(NamedTuple):
-    """Hypotheses that stand for all.
+    """Hypotheses that represent all.
 
     Attributes:
-        chosen: (K,) indices, in the order in which they were chosen.
-        owner: (N,) position in `chosen` of the hypothesis that stands for each.
+        chosen: (K,) indices, in the order of choice.
+        owner: (N,) position in `chosen` of the representative of each hypothesis.
         log_weights: (K,) of the groups.
     """
 
@@ -46,12 +46,12 @@ def choose_hypotheses(
     """The hypotheses to keep.
 
     Args:
-        joints: (N, J, 3) positions that distances are taken of, m.
+        joints: (N, J, 3) positions for the distances, m.
         log_weights: (N,).
-        count: how many to keep at most, K.
+        count: maximum number of kept hypotheses, K.
         same: mean distance below which two hypotheses are one, m.
-        cap: largest distance that a joint counts with, m.
-        first: hypotheses that are kept in any case, after the heaviest.
+        cap: maximum distance of a joint, m.
+        first: hypotheses that are always kept, after the heaviest.
     """
     n = len(log_weights)
     most = min(count, n)
@@ -70,10 +70,10 @@ def choose_hypotheses(
 
 
 def distinct_hypotheses(joints: Array, log_weights: Array, same: float) -> Index:
-    """Indices of hypotheses without those that have come to the same optimum, heaviest first.
+    """Indices of hypotheses at distinct optima, heaviest first.
 
     Args:
-        joints: (N, J, 3) positions that distances are taken of, m.
+        joints: (N, J, 3) positions for the distances, m.
         log_weights: (N,).
         same: mean distance below which two hypotheses are one, m.
     """

@@ -1,9 +1,9 @@
 """How poses are tracked: the settings of a tracker, and the numbers of its model.
 
-Settings are what users choose. The numbers below are the same for all of them. Each has its unit
-and its source: `Physical` follows from people or from sensors, `Chosen` was set by hand, by tracked
-clips. Numbers of a concept of a lower layer stand with it: the person in `body`, silhouettes,
-colours and keypoints in `image`, errors of cues in `inference.error_model`.
+Users choose the settings; the other numbers are constants. Each has its unit and its source:
+`Physical` follows from people or from sensors, `Chosen` was set by hand, by tracked clips. Numbers
+of a concept of a lower layer are defined there: the person in `body`, silhouettes, colours and
+keypoints in `image`, errors of cues in `inference.error_model`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MOTIONS = ('learned', 'random_walk')
 
 # --- Search
 
-# Evaluations of an image, where more hardly help. Chosen by accuracy on tracked clips.
+# Number of evaluations per image above which more hardly help. Chosen by accuracy on tracked clips.
 ACCURATE_BUDGET = 400
 # Ratio of the squared motion of the heaviest mode to the expected one above which an image is
 # surprising: the motion prior is wider than most motions. Chosen.
@@ -37,29 +37,30 @@ LIMB_TAILS = 4.0
 # Factor on the deviations of the body's prior where configurations of a limb are drawn from it.
 # Chosen.
 PRIOR_STRETCH = 1.3
-# Largest distance that a joint counts with where hypotheses are selected, m. Chosen.
+# Maximum distance of a joint in the selection of hypotheses, m. Chosen.
 MAX_JOINT_DISTANCE = 0.3
 
 # --- Weights and modes
 
 # Mean squared distance by which joints leave their prediction, m^2/s, and degrees of freedom of its
-# tails: modes tremble, and limbs are found where they were not looked for. Chosen.
+# Student tails: modes jitter, and limbs are found in unexpected places. Chosen.
 TRANSITION_SPREAD, TRANSITION_TAILS = 0.01, 2.0
-# A mode ends where all its continuations are less likely than exp(-c); c in nats. Chosen.
+# c of the probability exp(-c) below which all continuations of a mode lie if it ends, nats. Chosen.
 END_NATS = 5.0
 # Largest shift of a mode of the posterior to that of the likelihood, in standard deviations of the
 # posterior: the likelihood alone may be flat. Chosen.
 MAX_MODE_SHIFT = 5.0
-# Standard deviations beyond which a measurement is not explained, and a value not believed. Chosen.
+# Number of standard deviations above which a measurement is unexplained or a value implausible.
+# Chosen.
 GATE_SIGMAS = 4.0
 
 # --- Start of a track
 
-# Standard deviation of a length that was measured on the person, m: a tape. Physical.
+# Standard deviation of a length of the person measured with a tape, m. Physical.
 MEASURED_SIGMA = 0.01
 # Standard deviation of the place of a person in a given box, as a fraction of the distance. Chosen.
 BOX_SIGMA = 0.15
-# Headings from which a pose is fitted. Chosen.
+# Number of headings from which a pose is fitted. Chosen.
 HEADINGS = 8
 # Maximum number of poses that a track starts from. Chosen.
 MAX_STARTS = 96
@@ -70,56 +71,56 @@ SAME_MOMENT = 0.2
 
 # --- Shape of the person
 
-# Largest change by one image, and in all, in standard deviations over people. Chosen.
+# Largest change of the shape by one image, and in total, in standard deviations over people.
+# Chosen.
 MAX_SHAPE_STEP, MAX_SHAPE_CHANGE = 0.5, 3.0
-# Change from which the person is rebuilt with the estimate, in standard deviations over people
-# (2 mm of a length): whatever depends on a shape is rebuilt with it. Chosen.
+# Change of the estimate above which the body, and all that depends on it, is rebuilt, in standard
+# deviations over people (2 mm of a length). Chosen.
 REBUILDING_CHANGE = 0.1
-# Largest change of an angle that gives way while the shape is estimated, rad. Chosen.
+# Largest change of an angle that adapts to a change of the shape, rad. Chosen.
 MAX_ANGLE_SHIFT = 0.2
 
 # --- Gravity and floor
 
-# Standard deviation of a given direction of gravity whose own is unknown, rad: how well a camera is
-# mounted. Physical.
+# Default standard deviation of a given direction of gravity, rad, by the mounting of a camera.
+# Physical.
 GIVEN_UP_SIGMA = np.radians(2.0)
-# Standard deviation of gravity from the y axis of an image, rad: how people hold cameras. Chosen.
+# Standard deviation of gravity from the y axis of an image for handheld cameras, rad. Chosen.
 UP_SIGMA = np.radians(15.0)
-# Deviation of the axis of a standing body from the vertical, rad; along the line of sight it is
-# twice as large. That of the vertical never undercuts it. Chosen.
+# Standard deviation of the axis of a standing body from the vertical, rad, twice as large along the
+# line of sight; lower bound of that of the vertical. Chosen.
 AXIS_SIGMA = np.radians(4.0)
-# Time for which an error of the vertical lasts, by the axis of a body and by the lines of the
-# scene, s. Chosen.
+# Duration of an error of the vertical, by the axis of a body and by the lines of the scene, s.
+# Chosen.
 VERTICAL_TIME = 1.0
-# How fast the vertical is forgotten, rad/sqrt(s). Chosen.
+# Drift of the vertical, rad/sqrt(s). Chosen.
 UP_DRIFT = np.radians(1.0)
-# Time over which the lowest sole is followed, s, and its quantile that is the floor. Chosen.
+# Time window of the lowest sole, s, and the quantile in it that is the floor. Chosen.
 LEVEL_TIME, LEVEL_QUANTILE = 2.0, 0.75
-# Deviation of the floor from that quantile, m; that of one image is twice as large. Chosen.
+# Standard deviation of the floor from that quantile, m, twice as large by one image. Chosen.
 LEVEL_SIGMA = 0.04
-# Change of a given direction of gravity that no noise of a sensor makes: the camera turns, rad.
+# Change of a given direction of gravity above the noise of a sensor, so that the camera turns, rad.
 # Physical.
 TURN_NOISE = 0.003
-# Images from the start on that show a person head down by a given vertical, counted by the cosine
-# between trunk and vertical, above which it is the wrong way round though it points up in the
-# image: handstands are shorter. Chosen.
+# Number of images with a person head down, weighted by the cosine between trunk and vertical, after
+# which a given vertical that points up in the image is reversed: handstands are shorter. Chosen.
 HEAD_DOWN_IMAGES = 30.0
-# Log odds against a given vertical before any image, for a camera that is about upright, nats; as
-# much is the most that somebody who lies says: some do. Chosen.
+# Prior log odds for the given vertical of a nearly upright camera, nats, and bound on the evidence
+# of a lying person against it: some people do lie. Chosen.
 RIGHT_VERTICAL_NATS = 3.5
-# Largest log odds that one look at the lines of the scene says, nats. Chosen.
+# Largest log odds by one look at the lines of the scene, nats. Chosen.
 LOOK_NATS = 2.0
-# Concentration of the axes of people who do not lie about the vertical. Chosen.
+# Concentration about the vertical of the axes of people who do not lie. Chosen.
 UPRIGHT_CONCENTRATION = 8.0
 
 # --- Camera and appearance
 
-# Time for which the last known motion of the camera is taken to go on, s. Chosen.
+# Maximum time for which the last known motion of the camera is extrapolated, s. Chosen.
 MAX_EXTRAPOLATION_TIME = 0.5
-# More than this fraction of an image, or of a person, is most of it.
+# Fraction of an image, or of a person, above which it is most of it.
 MAJORITY = 0.5
-# Fraction of the usual value at which a silhouette is no evidence; at 0 it says that somebody is
-# absent, at twice this fraction present. Chosen.
+# Fraction of the usual value at which a silhouette is no evidence; 0 is full evidence of absence,
+# twice this fraction full evidence of presence. Chosen.
 UNDECIDED_FRACTION = 0.25
 
 
@@ -143,27 +144,27 @@ class LimbSearchSettings:
 
 @dataclass(frozen=True)
 class EvaluationPlan:
-    """Sizes of the search in an image, counted in evaluations: results do not depend on speed.
+    """Sizes of the search in an image, in evaluations, so that results do not depend on speed.
 
         budget B    predictions descend    limbs and trunks are rated    candidates descend
         share       about B / 8            at most 2 B / 3                about B / 5
 
-    Where limbs are searched for as well, at most 2 B / 5 are rated. The rest goes to covariances
-    and shape of the modes and to the likelihood alone. Settings bound each part; a budget below
-    them takes from all parts.
+    If limbs are searched for as well, at most 2 B / 5 are rated. The rest is for covariances and
+    shape of the modes and for the likelihood alone. Settings bound each part; a smaller budget
+    reduces all parts.
 
     Attributes:
         hypotheses: maximum number of modes that are kept, K.
         candidates: maximum number of hypotheses that are fully optimised.
         iterations: number of Newton steps on the predictions, and on the candidates.
-        groups: maximum number of groups of modes with a trunk of their own that are searched.
-        rated: maximum number of poses that are rated, all groups together, where limbs are
-            searched for.
+        groups: maximum number of searched groups of modes, each with a common trunk.
+        rated: maximum number of poses that are rated, all groups together, if limbs are searched
+            for.
         rated_alone: the same without limb search.
         alternatives: maximum number of configurations of a limb.
         combinations: maximum number of combinations on each trunk.
         searched_chains: number of limbs searched in each group.
-        samples, refined: number of samples that a limb draws, and of the best that are refined.
+        samples, refined: numbers of samples of a limb, and of the best ones that are refined.
         surprising: whether the image is surprising.
     """
 
@@ -265,12 +266,12 @@ class TrackerSettings:
 
     @cached_property
     def thorough_plan(self) -> EvaluationPlan:
-        """The same for a surprising image; as many modes are kept."""
+        """The plan for a surprising image, with the same number of modes."""
         plan = self._planned(SURPRISING_FACTOR * self.evaluation_budget)
         return replace(plan, hypotheses=self.plan.hypotheses, surprising=True)
 
     def _planned(self, budget: int) -> EvaluationPlan:
-        """The plan that keeps to an evaluation budget, and to the bounds of the settings."""
+        """The plan within an evaluation budget and the bounds of the settings."""
         hypotheses = min(self.max_hypotheses, max(budget // 25, 1))
         limbs, eighth = budget // 65, max(budget // 8, 1)
         searched = max(round(budget / ACCURATE_BUDGET), 1)
@@ -283,7 +284,7 @@ class TrackerSettings:
             rated_alone=2 * budget // 3,
             alternatives=min(self.alternatives, max(limbs, 2)),
             combinations=min(self.combinations, eighth),
-            # With less than a quarter no limb is searched.
+            # With less than a quarter of the accurate budget no limb is searched.
             searched_chains=min(self.searched_chains, searched)
             if SURPRISING_FACTOR * budget >= ACCURATE_BUDGET
             else 0,
@@ -295,68 +296,66 @@ class TrackerSettings:
 
 # --- Beliefs of a track
 
-# Rates at which chains of two states begin and end, 1/s.
+# Rates at which the second state of two-state chains begins and ends, 1/s.
 RATES: Mapping[str, tuple[float, float]] = MappingProxyType(
     {
-        # Somebody comes into an empty view, and leaves it. Chosen.
+        # A person enters an empty view, and leaves it. Chosen.
         'existence': (0.1, 0.2),
-        # Another takes the place of who was seen last, unseen, once in an hour. Chosen.
+        # Unseen, another person replaces the last one once in an hour. Chosen.
         'same person': (0.0, 1.0 / 3600.0),
-        # A track follows again, and fails; a cue shows the person again, or something else.
-        # Chosen.
+        # A track or a cue recovers, and fails. Chosen.
         'track and cues': (1.0, 0.05),
-        # A detector as a whole shows the person again, and somebody else. Chosen.
+        # A detector as a whole returns to the person, and turns to another. Chosen.
         'detector': (1.0, 0.02),
     }
 )
-# Largest log likelihood ratio of somebody against nobody in an image, nats, and how long its errors
-# last, s. A clear image is wrong in 1 of 3,000 cases, by some lasting cause that is not modelled. A
+# Largest log likelihood ratio of somebody against nobody in an image, nats, and duration of its
+# errors, s. A clear image is wrong in 1 of 3,000 cases, by a persistent cause outside the model. A
 # detector misses a badly visible person in about 1 of 100 images, for longer. Chosen.
 EXISTENCE_CUES: Mapping[str, tuple[float, float]] = MappingProxyType(
     {'clear': (8.0, 0.2), 'doubtful': (5.0, 0.25)}
 )
-# Probability of existence above which somebody is there, and a new track may start, and below which
-# nobody is, if the image says so. Between them it is undecided. Chosen.
+# Probabilities of existence above which somebody is present, so that a new track may start, and
+# below which nobody is, if the image is evidence of that. Between them it is undecided. Chosen.
 PRESENT_PROBABILITY, ABSENT_PROBABILITY = 0.85, 0.03
-# Fraction of a cue that is left to a silhouette which a side of the image may cut, and to keypoints
-# of a part of a person. Chosen.
+# Weight of the cue of a silhouette that a side of the image may cut, and of keypoints of a part of
+# a person. Chosen.
 PART_FRACTION = 0.6
-# Evidence of a cue that is wholly explained against one that is not at all, nats, and the number of
-# its measurements that give it: neighbours err together. Chosen.
+# Difference in evidence between a wholly explained cue and an unexplained one, nats, and the number
+# of measurements that suffices for it: neighbours have common errors. Chosen.
 VALIDITY_NATS, VALIDITY_COUNT = 16.0, 4
-# How long misfits of the modes to a cue last, s. Chosen.
+# Duration of misfits of the modes to a cue, s. Chosen.
 MISFIT_TIME = 0.1
 # Maximum evidence of one image about a cue, nats: it may be wrong in unforeseen ways. Chosen.
 MAX_CUE_NATS = 3.5
-# Probability that a mode has a part of the body where it is: limbs lag behind, and hide before the
-# trunk. Chosen.
+# Probability that a mode has the right place of a part of the body: limbs lag behind, and are hard
+# to see in front of the trunk. Chosen.
 PLACED_PROBABILITY = 0.8
 # Probability that the evidence of an image for a facing direction is about the person. Chosen.
 FACING_VALID = 0.9
-# Largest log odds of a facing direction, nats: those against a way that a start lacks. Chosen.
+# Largest log odds of a facing direction, nats, also of the only one that a start has. Chosen.
 MAX_FACING_NATS = 10.0
 # Least probability of an exchange of sides by a detector. Chosen.
 LEAST_EXCHANGE = 1e-6
-# Log weight below that of the heaviest mode up to which modes show where the person may be, nats.
-# Chosen.
+# Difference in log weight to the heaviest mode up to which a mode is likely, nats. Chosen.
 LIKELY_NATS = 4.0
-# Share of the time for which somebody stands on both feet, where contact is unknown. Chosen.
+# Probability that a person stands on both feet if contact is unknown. Chosen.
 RESTING_SHARE = 0.3
 
 # --- Modes
 
-# Gain by a step below which a minimum is found, nats. Chosen.
+# Reduction of the energy by a step below which a minimisation stops, nats. Chosen.
 MINIMUM_TOLERANCE = 0.02
-# Largest standard deviation of a variable of a mode, where an image shows nothing, and that of one
-# which rests on its limit (3 degrees), rad or m. Chosen.
+# Largest standard deviation of a variable of a mode, without evidence, and that of a variable on
+# its limit (3 degrees), rad or m. Chosen.
 MAX_SIGMA, LIMIT_SIGMA = 2.0, 0.05
-# How often the shape is fitted to the first image, and the number of the heaviest modes that it is
+# Number of fits of the shape to the first image, and number of the heaviest modes that the shape is
 # estimated from. Chosen.
 FIRST_SHAPE_FITS, SHAPE_MODES = 3, 4
-# How far a person gets from where one was predicted, m and m/s: keypoints of a leap are of another
-# person. No clip comes near it.
+# Largest distance of a person from the prediction, m, and its growth with time, m/s: keypoints
+# further away belong to another person. No clip reaches it.
 BODY_REACH, BODY_SPEED = 0.1, 4.0
 # Newton steps from the reversal of a mode to its optimum, before candidates are compared. Chosen.
 REVERSAL_ITERATIONS = 8
-# Bits of an identity below the number of the posture of unseen limbs.
+# Number of bits of an identity below those for the posture of unseen limbs.
 POSTURE_BITS = 20

@@ -1,4 +1,4 @@
-"""The shape of the person as a slow state: lengths and flesh, estimated as long as a track lasts.
+"""The shape of the person, lengths and flesh, estimated over a track.
 
     S_k = H_tt - H_tp C_k H_pt,    g_k = h_t - H_tp C_k h_p,    C_k = H_pp^-1            at mode k
     J_k = -C_k H_pt                                                                 dx_k / dtheta
@@ -6,11 +6,11 @@
     P = (P_0^-1 + A / (1 + c n))^-1,    theta = P b / (1 + c n)
 
 theta is the shape (see `body.shape`), x_k the pose of mode k, h and H are gradient and Gauss-Newton
-Hessian of the energy of one image over both. A pose gives way to a wrong shape: the information
-left when it does is the Schur complement S. Every image counts with the share tau, as its errors
-are those of its neighbours, and all images together with no more than 1 / c of one
-(`inference.error_model`): clothes, and all else that the model lacks, are the same in all of them,
-and would in the end outweigh the prior over people. Uncertainty of the shape makes the pose
+Hessian of the energy of one image over both. The pose adapts to a wrong shape: the information
+that remains is the Schur complement S. Every image counts with the share tau, because neighbouring
+images have the same errors, and all images together with no more than 1 / c of one
+(`inference.error_model`): clothes, and everything else that the model lacks, are the same in all of
+them, and would finally outweigh the prior over people. Uncertainty of the shape makes the pose
 uncertain: J P J' is added to the covariances of modes (a consider covariance, [Schmidt 1966]).
 """
 
@@ -55,8 +55,7 @@ class ShapeEstimate:
     """Estimates the shape of one person.
 
     Args:
-        body: that the estimate starts from; its `length_covariance` tells how well its lengths
-            are known.
+        body: initial estimate, with the prior `length_covariance`.
 
     Attributes:
         covariance: (P, P) of the shape.
@@ -70,7 +69,7 @@ class ShapeEstimate:
         self._information, self._vector = np.zeros((size, size)), np.zeros(size)
         self._count = 0.0
         self._offset = np.zeros(size)
-        # The offset of the person, who follows the estimate in steps.
+        # The offset of the present body, which follows the estimate in steps.
         self._taken = self._offset
         self._seen: Observation | None = None
         self._known: tuple[Array, Linearised] | None = None
@@ -91,15 +90,15 @@ class ShapeEstimate:
         *,
         trust: float,
     ) -> Body:
-        """Uses one more image; returns the person.
+        """Updates the shape by an image; returns the person's body.
 
         Args:
             likelihood: of the present body.
             observation: of the image.
             poses, weights: (K, d), (K,) modes at the image.
             gradients: (K, d) of the energy of the image and the body's prior, by the pose.
-            covariances: (K, d, d) inverse Hessians of that energy; on a limit a variable has none.
-            trust: tau, share of the image that is believed.
+            covariances: (K, d, d) inverse Hessians of that energy, 0 for variables on a limit.
+            trust: tau, share of the image.
         """
         linear = self.linearised(likelihood, observation, poses)
         size, turns = self._space.size, self._space.body.skeleton.dof_is_rotation
@@ -146,8 +145,8 @@ class ShapeEstimate:
     ) -> Linearised:
         """The energy of the contours and keypoints of an image around poses (N, d).
 
-        The result for the last image is kept: covariances and shape ask for the same modes, first
-        all and then the best.
+        The last result is cached: covariances and shape need the same modes, first all of them and
+        then the best.
         """
         n = len(poses)
         if self._seen is observation and self._known is not None:

@@ -1,16 +1,16 @@
-"""The state of a track beside its modes: one object, and what is published of it.
+"""The state of a track beside its modes, and the published estimate.
 
-    existence   whether somebody is in view                                    `existence`
-    validity    whether modes are where the person is, and cues show the person `validity`
-    identity    whether who is in view now is who was seen last                 `SAME_PERSON`
+    existence   whether a person is in view                                    `existence`
+    validity    whether modes are at the person, and cues show the person      `validity`
+    identity    whether the person in view is the one who was seen last        `SAME_PERSON`
 
         WAITING or NOBODY  -> (a start)                         ->  TRACKING
-        TRACKING           -> (no image says where)             ->  LOST
+        TRACKING           -> (no image shows where)            ->  LOST
         LOST               -> (found again)                     ->  TRACKING
-        TRACKING or LOST   -> (an image says: nobody is there)  ->  NOBODY
+        TRACKING or LOST   -> (an image shows nobody)           ->  NOBODY
         TRACKING or LOST   -> (not seen for an hour)            ->  WAITING, for anybody
 
-The classes of the modes, which are chains, too, are with the modes (`hypotheses.Modes`).
+The classes of the modes, which are chains, too, are stored with the modes (`hypotheses.Modes`).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from hmt_ros.tracking.prediction import Forecaster
 from hmt_ros.tracking.settings import RATES
 from hmt_ros.tracking.validity import Validity
 
-# Whether who comes is who was seen last.
+# Chain of whether the person in view is the one who was seen last.
 SAME_PERSON = MarkovChain.of_two(*RATES['same person'])
 
 
@@ -45,11 +45,11 @@ class TrackState:
     """The state of a track, or of the wait for one.
 
     Attributes:
-        existence: whether somebody is in view.
+        existence: whether a person is in view.
         validity: of the modes and of the cues.
-        ended: whether a track has ended: who comes now starts another one.
+        ended: whether a track has ended, so that the next person starts another one.
         met: stamp of the last image that showed the person, ns; None: nobody is known.
-        stamp: of the last image, ns; None: there was none.
+        stamp: of the last image, ns; None: no image yet.
         followed: stamp of the last image that the modes were fitted to, ns; None: no track.
     """
 
@@ -76,13 +76,13 @@ class TrackState:
 
     @property
     def probability(self) -> float:
-        """Probability that somebody is in view; NaN: nothing has said anything of that."""
+        """Probability that a person is in view; NaN without any evidence."""
         known = self.begun or self.existence.told
         return self.existence.probability if known else math.nan
 
     @property
     def nobody_shown(self) -> bool:
-        """Whether the last image itself has said that nobody is there; a covered lens does not."""
+        """Whether the last image itself shows that nobody is there, unlike a covered lens."""
         return self.ended and self.existence.nobody
 
     def age(self, stamp: int) -> float:
@@ -90,16 +90,16 @@ class TrackState:
         return 0.0 if self.followed is None else seconds(stamp - self.followed)
 
     def is_somebody_else(self, stamp: int) -> bool:
-        """Whether who is in view at a stamp, ns, more likely is not who was seen last."""
+        """Whether the person in view at a stamp, ns, is more likely not the one seen last."""
         if self.met is None:
             return False
         return bool(SAME_PERSON.closed(1.0, seconds(stamp - self.met)) < 0.5)
 
     def reason(self, scene: str, misfit: float) -> str:
-        """What is missing where the state is neither tracking nor nobody; '' where nothing is.
+        """Text on what is missing in a state other than tracking and nobody; '' if nothing.
 
         Args:
-            scene: what is missing for silhouettes.
+            scene: text on what is missing for silhouettes.
             misfit: share of the last image that no mode explains.
         """
         status, existence = self.status, self.existence
@@ -119,38 +119,38 @@ class TrackState:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What a tracker knows after an image.
+    """The estimate of a tracker after an image.
 
     Attributes:
         status: state of the tracker.
-        reason: what is missing where it is neither tracking nor nobody; '' where nothing is.
-        existence_probability: that somebody is in view, given all images so far; NaN: nothing has
-            said anything of that.
-        nobody_shown: whether the last image itself has said that nobody is there; a covered lens
-            does not.
+        reason: text on what is missing in a state other than tracking and nobody; '' if nothing.
+        existence_probability: probability that a person is in view, given all images so far; NaN
+            without any evidence.
+        nobody_shown: whether the last image itself shows that nobody is there, unlike a covered
+            lens.
         started_from: the input that this track began from; None before the first.
         body: the person, with the present estimate of lengths and flesh.
-        modes: of the track, heaviest first, as they are carried on; none without a track.
-        published: the modes of the posterior: limbs that no image shows are as people hold them.
+        modes: propagated modes of the track, heaviest first; empty without a track.
+        published: modes of the published posterior, with unseen limbs spread over usual postures.
         point_estimate: (d,) the pose of least expected distance of the joints from the person's;
             empty without a track.
         likelihood: of the last image that was tracked.
-        shown: what the last image shows, as far as it is believed; None: nothing of the person.
-        foreseen: whether the last image showed nothing of the person: a prediction is published.
+        shown: evidence of the last image, weighted by the beliefs; None if it shows no person.
+        foreseen: whether the last image did not show the person, so that a prediction is published.
         misfit: share of the last image that no mode explains.
         evaluations: number of evaluations of the likelihood in the last image.
-        validity: how far each cue of the images is believed to show the person, and the track.
+        validity: probabilities that the track and each cue of the images are valid.
         contacts: probability by foot, 'left_foot' and 'right_foot', that the heaviest mode rests on
-            it. Empty while it is unknown: there is no track, the body has no feet, the terms of the
-            ground are off, or the motion of the camera is unknown. The camera stands still where
-            there is a background image, and moves as `Tracker.set_camera` says.
+            it. Empty if unknown: there is no track, the body has no feet, the ground terms are off,
+            or the motion of the camera is unknown. The camera is fixed if there is a background
+            image, or moves as given by `Tracker.set_camera`.
         ground: gravity and floor, as far as they are known or estimated.
-        vertical: (3,) unit vector against gravity, camera frame, as given or as the scene shows it;
-            None: it is unknown, at most guessed from the track.
-        gravity_contradicted: whether scene or person contradict the gravity that is given; it is
-            used all the same.
-        gravity_reversed: whether the gravity that is given is the opposite, as an accelerometer
-            measures it.
+        vertical: (3,) unit vector against gravity, camera frame, given or shown by the scene; None:
+            unknown, or only guessed from the track.
+        gravity_contradicted: whether scene or person contradict the given gravity, which is used
+            nevertheless.
+        gravity_reversed: whether the opposite of the given gravity is used, because it has the sign
+            of an accelerometer.
         motion: the setting.
         stamp_ns: of the last image that the modes were fitted to; None: there is no track.
     """
@@ -180,30 +180,30 @@ class Estimate:
 
     @property
     def posterior(self) -> GaussianMixture:
-        """The posterior over poses; without a track it has no components."""
+        """The posterior over poses, without components if there is no track."""
         return self.published.mixture
 
     @property
     def velocities(self) -> Array | None:
-        """Velocities (K, d) of the published modes, per second; None: unknown.
+        """Velocities (K, d) of the published modes, per second; None if unknown.
 
-        They are unknown in the first image of a track, and where poses walk randomly.
+        They are unknown in the first image of a track, and with the random walk.
         """
         velocities = self.published.velocities
         return velocities if velocities.any() else None
 
     @property
     def origins(self) -> Array:
-        """Probabilities (K, M) that component k of the posterior continues component m before.
+        """Probabilities (K, M) that component k of the posterior continues previous component m.
 
-        M is the number of components of the image before, 0 where a track begins or is found again;
-        see `LaggedWeights`.
+        M is the number of components of the previous image, 0 where a track starts or restarts; see
+        `LaggedWeights`.
         """
         return np.eye(len(self.published)) if self.foreseen else self.published.origins
 
     @property
     def forecaster(self) -> Forecaster:
-        """Predicts the track from the last image that it followed.
+        """Predictor of the track from the last image that the modes were fitted to.
 
         Raises:
             ValueError: there is no track.
@@ -214,7 +214,7 @@ class Estimate:
 
 
 def no_likelihood(dimension: int) -> Likelihood:
-    """The likelihood over poses of d variables before the first image: it says nothing."""
+    """The empty likelihood over poses of d variables, before the first image."""
     square = np.zeros((dimension, dimension))
     nothing = GaussianMixture(np.empty(0), np.empty((0, dimension)), square[None][:0])
     none, nobody = np.empty(0), np.empty(0, dtype=np.intp)

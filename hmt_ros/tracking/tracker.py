@@ -1,12 +1,12 @@
-"""Follows one person through images: starts a track, moves it on, notices when it is lost.
+"""Follows one person through images: starts a track, updates it, notices when it is lost.
 
-    observe      the image in the frame and the light of what is known     `View`
-    believe      whether somebody is there, and which cues show who is     `TrackState`
-    propagate    the modes to the image, or start a track, or end it       `MixtureFilter`
-    publish      what is known now                                         `Estimate`
+    observe      the image, in the present camera frame                    `View`
+    believe      existence of a person, and validity of the cues           `TrackState`
+    propagate    the modes to the image, or start or end a track           `MixtureFilter`
+    publish      the present estimate                                      `Estimate`
 
-The tracker knows images, background, starts and existence; a `MixtureFilter` knows the person and
-carries the mixture.
+The tracker handles images, background, starts and existence; a `MixtureFilter` holds the person and
+the mixture.
 """
 
 from __future__ import annotations
@@ -69,17 +69,17 @@ class Tracker:
 
     Args:
         body: model of the person; a subject's lengths replace the model's when a track starts.
-        camera: calibrated.
+        camera: the calibrated camera.
         settings: of the tracking.
-        background: the empty scene; None, or a model that has learned nothing: learned from images
-            before the track starts, and if there are none the silhouette is not used.
+        background: model of the empty scene. If it is None or empty, it is learned from images
+            before the track starts; without such images, silhouettes are not used.
         seed: of all randomness. The same images, settings and seed give the same numbers.
         extra: further energy terms of the posterior.
         known_ground: gravity and floor, as far as they are known; the rest is estimated.
-        shared_background: whether the background is that of several trackers; none learns it.
+        shared_background: whether several trackers share the background; then none learns it.
 
     Attributes:
-        model, camera, settings: as above; the model without the lengths of a subject.
+        model, camera, settings: as above; the model does not have the lengths of a subject.
         silhouettes: source of the silhouettes of the images.
         track_id: number of the present track, or of the last one; 0 before the first.
         estimate: what is known after the last image.
@@ -105,7 +105,7 @@ class Tracker:
         self._observer = Observer(camera, self.settings, self.silhouettes)
         self._seed = seed
         self._extra = tuple(extra)
-        # What the track starts from, and where the person is in the next image.
+        # The start that the user gave, and the box of the person in the next image.
         self._given: Subject | GaussianMixture | None = None
         self._box: Box | None = None
         self._started_from: Source | None = None
@@ -129,10 +129,10 @@ class Tracker:
 
         Args:
             start: a subject, whose track starts at the first image at or after its stamp, or a
-                mixture over poses of the present body, or None: the start that was given last. If
-                none was given, keypoints, a mask or a prediction start it, whichever comes first.
-            box: (left, top, right, bottom) in which the person is in the next image, px; the track
-                starts there.
+                mixture over poses of the present body. None repeats the last given start; if
+                there is none, the first keypoints, mask or prediction that suffice start a track.
+            box: (left, top, right, bottom) that contains the person in the next image, px; the
+                track starts there.
 
         Raises:
             ValueError: a mixture of another dimension, or a box that is not in the image.
@@ -166,29 +166,29 @@ class Tracker:
         others: Mask | None = None,
         depth: NDArray[np.floating] | None = None,
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
-        """Takes the next image.
+        """Processes the next image.
 
         Args:
             image: (H, W, 3) BGR uint8, of the camera's size.
-            stamp: of the image, ns; later than the one before.
-            keypoints: joints seen in this image; without any that was seen: the detector saw
-                nobody. None: there is no detector, or it has not answered.
-            prediction: poses that a regression expects by this image, if any. They start a track
-                that has no other start, and no keypoints that suffice, with the lengths that they
-                assume, are among the hypotheses of every image, and of a lost track; they are no
-                evidence, which would count the image twice.
-            mask: (H, W) where a segmenter sees the person, which replaces background subtraction;
-                all false: it sees nobody; None: unknown.
+            stamp: of the image, ns; later than the previous one.
+            keypoints: joints detected in this image. If none of them is seen, the detector saw
+                nobody; None: there is no detector, or it has not answered.
+            prediction: poses that a regression predicts from this image, if any. They are
+                hypotheses in every image and in the search for a lost track, and start a track
+                if there is no other start and keypoints do not suffice, with the lengths that
+                they assume. They are no evidence: that would count the image twice.
+            mask: (H, W) pixels of the person by a segmenter; replaces background subtraction. If
+                all are false, the segmenter sees nobody; None: unknown.
             nobody_predicted: whether that regression saw nobody in this image.
-            others: (H, W) pixels that somebody else covers or may cover: no evidence for a
-                pose or against it; None: there are none.
+            others: (H, W) pixels that other people cover or may cover, which are no evidence for
+                or against a pose; None: no such pixels.
             depth: (H, W) depth at each pixel, along the axis of the camera, m; 0, NaN and values
                 out of range are no evidence. None: unknown.
 
         Returns:
             The posterior p(x_t | R_t) and the likelihood p(r_t | x_t), undiscounted (see
             `Likelihood.errors`), as mixtures over poses, heaviest first with weights that sum to 1;
-            (None, None) while there is no track, before the first or because nobody is in view.
+            (None, None) while there is no track: before the first one, or while nobody is in view.
 
         Raises:
             ValueError: an image, mask or depth of another size, a stamp that does not increase, or
@@ -212,27 +212,27 @@ class Tracker:
     def set_gravity(
         self, up: ArrayLike, camera_height: float | None = None, up_sigma: float = GIVEN_UP_SIGMA
     ) -> None:
-        """Takes a newer direction against gravity, before the image that it belongs to.
+        """Sets the direction against gravity for the next image.
 
         Args:
             up: (3,) unit vector in the camera frame.
-            camera_height: height of the camera above the floor, m; None: as it was known before.
+            camera_height: height of the camera above the floor, m; None: unchanged.
             up_sigma: standard deviation of the direction about each horizontal axis, rad.
 
         Raises:
-            ValueError: it is no unit vector, or the height is not positive.
+            ValueError: `up` is no unit vector, or the height is not positive.
         """
         self._newer_gravity = KnownGround(unit_vector(up), camera_height, up_sigma)
 
     def set_camera(self, position: ArrayLike, rotation: ArrayLike) -> None:
-        """Takes the pose of the camera, before the image that it belongs to.
+        """Sets the pose of the camera for the next image.
 
-        Motion, gravity, floor and contacts are then those of the fixed frame, while the mixture
-        stays in the camera frame. An image without a pose is taken to go on with the last motion
-        of the camera, for half a second at most.
+        Motion, gravity, floor and contacts then refer to the fixed frame, while the mixture stays
+        in the camera frame. Where an image has no pose, the last motion of the camera is
+        extrapolated for at most half a second.
 
         Args:
-            position: (3,) of the camera in a frame that stands still, m; its axes may be any.
+            position: (3,) of the camera in a fixed frame with any axes, m.
             rotation: (3, 3) from the camera optical frame to that frame.
 
         Raises:
@@ -243,7 +243,7 @@ class Tracker:
     # Observe.
 
     def _move_camera(self, stamp: int) -> None:
-        """Carries the estimates into the camera frame of the next image; takes newer gravity."""
+        """Moves the estimates to the camera frame of the next image; applies newer gravity."""
         pose, self._camera_pose = self._camera_pose, None
         motion = self._camera_path.advance(stamp, pose)
         if motion is not None:
@@ -258,7 +258,7 @@ class Tracker:
             self.silhouettes.see_from(pose, self.camera)
 
     def _observe(self, given: View) -> View:
-        """The view of an image, after what it shows of the ground and of the scene."""
+        """Returns the view of an image, after the ground and the scene are updated from it."""
         ground, silhouettes = self._ground, self.silhouettes
         self._track.spent.clear()
         self._move_camera(given.stamp)
@@ -272,7 +272,7 @@ class Tracker:
         before = self._track.body
         body = before if self._state.begun else before.levelled(ground.level)
         if body is not before:
-            # Before a track starts the body is level by what is known of gravity.
+            # Before a track starts, the body is levelled by the estimated gravity.
             self._track = self._new_track(body)
             if isinstance(self._given, GaussianMixture):
                 self._given = relevelled(before, self._given, body)
@@ -289,12 +289,12 @@ class Tracker:
         view = self._observer.view(given, self._track.person, near, dt)
         ghost = not self._state.begun or self._started_from in FROM_SILHOUETTES
         if silhouettes.doubted > doubted and ghost:
-            # What was seen was a ghost, as far as anybody knows.
+            # The track may have followed a ghost: an error of the background.
             self._drop_track(TrackState(stamp=self._state.stamp))
         return view
 
     def _lifted(self, keypoints: Keypoints | None, stamp: int) -> Keypoints | None:
-        """Keypoints with the mixture over whole poses by experts, or by a detector that lifts."""
+        """Adds to keypoints the mixture over whole poses by experts, or by a 3D detector."""
         if keypoints is None or not keypoints.seen.any():
             return keypoints
         opinions = []
@@ -311,19 +311,19 @@ class Tracker:
     # Believe.
 
     def _believe(self, view: View) -> None:
-        """Updates the beliefs that somebody is there, and that it is who was seen last."""
+        """Updates the beliefs that a person is in view, and that it is still the same person."""
         if self._state.is_somebody_else(view.stamp):
-            # Of whoever comes now nothing is known.
+            # Nothing is known about the next person.
             self._landmarks = LandmarkOffsets()
             self._drop_track(replace(self._state, ended=True, met=None), self.model)
         state = self._state
         if not (state.begun or state.ended or view.mask is not None):
-            # A background may still be learned: its silhouettes are no start.
+            # The background may still be learning, so its silhouettes cannot start a track.
             view = view._replace(anywhere=None, silhouette=None)
         state.existence.look(view, self._track.person, waiting=not state.begun)
 
     def _judge(self, judged: Judged, depths: ImageMap | None, dt: float) -> None:
-        """Updates the beliefs in modes and cues of an image, dt s after the one before."""
+        """Updates the beliefs in modes and cues by an image, dt s after the previous one."""
         validity, track = self._state.validity, self._track
         validity.update(judged.misfits, dt, judged.alone)
         if depths is not None:
@@ -333,7 +333,7 @@ class Tracker:
     # Propagate, start or end.
 
     def _propagate(self, view: View) -> Observation:
-        """Moves the track on to an image; what the image shows, as far as it is believed."""
+        """Moves the track to an image; returns the observation, weighted by the beliefs."""
         state, track = self._state, self._track
         if state.existence.last.elsewhere:
             view = self._observer.view(view, track.person, None, 0.0)
@@ -353,16 +353,16 @@ class Tracker:
         return believed
 
     def _search(self, observation: Observation, prediction: PosePrediction | None) -> Array | None:
-        """See `poses_to_search`."""
+        """Poses for a search in the image, see `poses_to_search`; None if there are none."""
         gravity = self._ground.gravity(self.settings.ground.upright_weight)
         return poses_to_search(self._track.person, self.camera, observation, prediction, gravity)
 
     def _start(self, view: View) -> Observation | None:
-        """Starts a track, if it starts at this image; returns the observation it started with."""
+        """Starts a track if this image allows it; returns the observation of the start."""
         state, existence = self._state, self._state.existence
         somebody = existence.somebody and existence.last.llr > 0.0
         if state.ended and self._box is None:
-            # Somebody comes into view after another track has ended.
+            # A person enters the view after another track has ended.
             observation = self._observer.observation(view, None, state.validity)
             poses = self._search(observation, view.prediction) if somebody else None
             if poses is None:
@@ -380,11 +380,12 @@ class Tracker:
         return replace(observation, beliefs=state.validity.beliefs)
 
     def _given_start(self, view: View, *, somebody: bool) -> Observation | None:
-        """Starts a track from what was given, or from an image, if it suffices.
+        """Starts a track from the given start, or from an image, if it suffices.
 
         Args:
             view: of the image.
-            somebody: whether existence tells of somebody; if not, the start itself does.
+            somebody: whether the existence filter reports a person; if not, the start itself
+                makes one certain.
         """
         masked, existence, silhouettes = (
             view.mask is not None,
@@ -422,7 +423,7 @@ class Tracker:
             self._begin(observation, source, start)
             if self._state.validity.believes(SILHOUETTE):
                 break
-            # The start is where the person is; the silhouette is not: once more without it.
+            # The silhouette contradicts the start, which is right: repeat without silhouette.
         if not somebody:
             self._state.existence = Existence(GIVEN)
             self._meet(view)
@@ -440,7 +441,7 @@ class Tracker:
         )
 
     def _drop_track(self, state: TrackState, body: Body | None = None) -> None:
-        """Keeps nothing but a state and the body, or takes another one."""
+        """Drops everything but a state and the body, which may be replaced."""
         state.existence.appearance = Appearance()
         self._state = replace(state, validity=Validity(), followed=None)
         self._track = self._new_track(body or self._track.body)
@@ -450,19 +451,19 @@ class Tracker:
     # Learn and publish.
 
     def _meet(self, view: View) -> None:
-        """Learns the appearance of the person, whom an image shows."""
+        """Learns the appearance of the person from an image."""
         self._state.met = view.stamp
         self._state.existence.appearance.learn(
             view, view.stamp, self._track.person, self.camera, self._track.modes.poses[0]
         )
 
     def _learn(self, view: View, *, image_counts: bool) -> None:
-        """Takes in what the modes of an image tell of scene, ground and person."""
+        """Updates background, ground, appearance and landmarks by the modes of an image."""
         state, track, modes = self._state, self._track, self._track.modes
         shown = {KEYPOINTS: view.keypoints is not None, DEPTH: view.depth is not None}
         told = any(shown[cue] and state.validity.believes(cue) for cue in shown)
         if view.mask is None and told and not state.validity.lost:
-            # Something else than silhouettes says where the person is.
+            # Another cue than the silhouette locates the person.
             likely = modes.poses[modes.log_weights > -LIKELY_NATS]
             self.silhouettes.complete(view.image, track.person, self.camera, likely)
         if self.settings.ground.on:
@@ -480,11 +481,11 @@ class Tracker:
     def _publish(
         self, stamp: int, observation: Observation | None
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
-        """What `step` returns, and the estimate.
+        """Updates the estimate; returns the result of `step`.
 
         Args:
             stamp: of the image, ns.
-            observation: that the modes were fitted to; None: they were not.
+            observation: that the modes were fitted to; None: no fit.
         """
         state, track = self._state, self._track
         before, modes, posterior = state.stamp, track.modes, track.posterior
@@ -494,7 +495,7 @@ class Tracker:
             shown = SeenImage(posterior.likelihood, observation, posterior.known(observation))
         if foreseen:
             observation = Observation()
-            # The modes are kept as they are.
+            # The modes are unchanged.
             modes = replace(modes, origins=np.eye(len(modes)))
         if observation is not None:
             self._likelihood = likelihood_modes(

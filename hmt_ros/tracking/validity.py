@@ -1,34 +1,34 @@
-"""Whether cues of the images, and the track, are about the person: two-state chains.
+"""Validity of the track and of the cues of the images, as two-state chains.
 
-    P <- [exp(Q dt)] x ... x [exp(Q dt)] P          the track and each cue fail, and come back   (1)
+    P <- [exp(Q dt)] x ... x [exp(Q dt)] P          the track and each cue fail, and recover     (1)
     e_g = E_outlier - E_inlier = N (u - m_g)        m_g: share of cue g that is not explained    (2)
     log P(v) <- log P(v) + a(dt) v_0 (e_0 + sum_g v_g e_g)                                       (3)
 
-P is the joint probability of v = (v_0, v_1, ..), 1 where a mode of the track is about where the
-person is (v_0) and where cue g shows the person (v_g); a(dt) = tanh(dt / (2 tau)) is the share that
-is left to an image because misfits last (`error_model`). A misfit is put down to the cue or to the
-track, whichever of the two is less likely given all other cues: (3) is exact, and summed over v_g
-it is minus the energy -log(p exp(-E_inlier) + (1 - p) exp(-E_outlier)). e_0 is the evidence of the
-outline of the silhouette for the track, whether the silhouette is whole or not: clothes in the
-colours of the room leave holes in it, and the rest of it is where the person is.
+P is the joint probability of v = (v_0, v_1, ..). v_0 is 1 if a mode of the track is near the
+person, v_g is 1 if cue g shows the person; a(dt) = tanh(dt / (2 tau)) is the remaining share of an
+image, because misfits persist (`error_model`). A misfit is attributed to the cue or to the track,
+to that of the two which is less likely given all other cues: (3) is exact, and summed over v_g it
+is minus the energy -log(p exp(-E_inlier) + (1 - p) exp(-E_outlier)). e_0 is the evidence of the
+outline of the silhouette for the track, whether the silhouette is valid or not: clothes in the
+colours of the room leave holes in it, but the rest of it is at the person.
 
-A part of the body may be misplaced in a mode of a track that is right, and cover anything: the e_g
-of parts is log(w exp(e_g) + 1 - w) - log(w + (1 - w) exp(e_g)), at most log w / (1 - w) either way,
-w = `PLACED_PROBABILITY`. Where a track begins the pose was given.
-A silhouette of something else leads the modes x to itself, which then explain it. Where they leave
-more than a quarter of the keypoints, a pose x' by keypoints alone (`proposals.whole_poses`)
-stands for the states without the silhouette:
+A part of the body may be misplaced in a mode of a valid track, and cover anything: the e_g of parts
+is log(w exp(e_g) + 1 - w) - log(w + (1 - w) exp(e_g)), at most log w / (1 - w) either way,
+w = `PLACED_PROBABILITY`, except at a start, where the pose is given.
+A silhouette of something else draws the modes x to itself, which then explain it. If they miss more
+than a quarter of the keypoints, a pose x' by keypoints alone (`proposals.whole_poses`) represents
+the states without the silhouette:
 
     a sum_g v_g e_g  <-  log t(x_v) + a sum_g v_g min(e_g(x_v), 0)        x_v: x' where v_s = 0  (4)
 
-A pose that was moved to fit a cue is no evidence for that cue. t is how well the pose went on from
-the image before (`weighting`) when the two parted.
+A pose that was moved to fit a cue is no evidence for that cue. t is the transition density of the
+pose from the previous image (`weighting`), in the image in which the two poses separated.
 
-Depths, whose misfit is that of a pose moved to where they place it, do not test the track: they
-have a chain of their own, which takes in log(P(v_0) exp(e_g) + 1 - P(v_0)).
+The misfit of depths is that of a pose moved to them, so depths do not test the track: they have a
+chain of their own, with the evidence log(P(v_0) exp(e_g) + 1 - P(v_0)).
 
 In an image each cue counts with the energy p_g E_g, to which the energy above is equal in first
-order around E_outlier, with the p_g of (1), before the image: weights and optima hold the same sum.
+order around E_outlier, with the p_g of (1), before the image: weights and optima use the same sum.
 A cue that as a whole more likely shows something else is left out: a silhouette, depths, a
 detection. The p_g of groups of keypoints are those of a detector that sees the person.
 """
@@ -60,8 +60,8 @@ from hmt_ros.tracking.settings import (
 CHAIN = MarkovChain.of_two(*RATES['track and cues'])
 
 DEPTH = 'depth'
-# Misfit u at which a cue is as likely to be of something else: between those of images that show
-# the person and those that do not. Clothes in the colours of the room leave holes in a silhouette.
+# Misfit u at which a cue shows the person or something else with equal probability. Clothes in the
+# colours of the room leave holes in a silhouette.
 UNDECIDED = {SILHOUETTE: 0.4, OUTLINE: 0.4, KEYPOINTS: 0.25, DEPTH: 0.15}
 # Axes of the joint probability: the track, the detector of keypoints, and the cues.
 TRACK, DETECTOR = range(2)
@@ -69,7 +69,7 @@ AXES = {SILHOUETTE: slice(2, 3), KEYPOINTS: slice(3, 3 + EXCHANGED.shape[1])}
 CHAINS = AXES[KEYPOINTS].stop
 # States (2^n, n) of the chains, and validity v in each: groups of a failed detector are invalid.
 STATES = np.array(np.unravel_index(np.arange(2**CHAINS), (2,) * CHAINS)).T
-# (n, 2) rates at which each begins and ends.
+# (n, 2) rates at which each chain recovers and fails, 1/s.
 AXIS_RATES = np.tile(RATES['track and cues'], (CHAINS, 1))
 AXIS_RATES[DETECTOR] = RATES['detector']
 VALID = STATES.astype(np.float64)
@@ -78,12 +78,12 @@ WITHOUT_SILHOUETTE = (VALID[:, AXES[SILHOUETTE]] == 0).all(1)
 
 
 class ByKeypoints(NamedTuple):
-    """A pose by keypoints alone, where modes that follow the silhouette miss too many of them.
+    """A pose by keypoints alone, for when modes that follow the silhouette miss too many of them.
 
     Attributes:
-        keypoints: its misfit to them.
-        gain: log ratio of its transition to that of the heaviest mode when the two parted, nats, in
-            the first image that reports them.
+        keypoints: its misfit to the keypoints.
+        gain: log ratio of its transition density to that of the heaviest mode in the image in which
+            the two separated, nats; 0 after the first report.
     """
 
     keypoints: Misfit
@@ -113,7 +113,7 @@ class Validity:
 
     @property
     def cues(self) -> dict[str, Array]:
-        """By name the probabilities that the groups of a cue show the person.
+        """Probabilities, by name of the cue, that its groups show the person.
 
         Shapes: silhouette (1,), keypoints by group (3,), depths (1,).
         """
@@ -125,7 +125,7 @@ class Validity:
 
     @property
     def lost(self) -> bool:
-        """Whether the modes more likely are elsewhere than the person."""
+        """Whether the modes are more likely away from the person than near."""
         return self.track < 0.5
 
     @property
@@ -153,26 +153,26 @@ class Validity:
         }
 
     def predict(self, dt: float) -> None:
-        """Goes on by dt seconds, equation (1)."""
+        """Predicts the probabilities dt seconds ahead, equation (1)."""
         self._depth = CHAIN.predict(self._depth, dt)
         joint = self.joint.copy()
         step_chains(AXIS_RATES, dt, joint)
         self._take(joint)
 
     def search(self) -> None:
-        """The track begins anew: nothing is known of its modes."""
+        """Resets the probability of the track, whose modes start again."""
         of_cues = self.joint.reshape(2, -1).sum(TRACK)
         self._take(np.multiply.outer(CHAIN.usual, of_cues).ravel())
 
     def update(
         self, misfits: Mapping[str, Misfit], dt: float, alone: ByKeypoints | None = None
     ) -> None:
-        """Takes in the misfits of the modes to the cues of an image.
+        """Updates the probabilities by the misfits of the modes to the cues of an image.
 
         Args:
             misfits: by cue, and of the outline of the silhouette.
-            dt: time since the image before, s; infinite: there is none.
-            alone: the pose by keypoints alone; None: the modes explain enough of them.
+            dt: time since the previous image, s; infinite at a start.
+            alone: the pose by keypoints alone; None: not needed.
         """
         share, begun = share_of_time(dt, MISFIT_TIME), bool(np.isfinite(dt))
         says = {
@@ -193,16 +193,16 @@ class Validity:
         self._take(update(self.joint, log_ratios))
 
     def update_depths(self, share: float, dt: float) -> None:
-        """Takes in the share of depths that no pose explains; dt as for `update`."""
+        """Updates the validity of depths by their unexplained share; dt as for `update`."""
         self.update({DEPTH: Misfit(np.array([share]), np.array([VALIDITY_COUNT]))}, dt)
 
 
 def _divided(of_track: Array, share: float, alone: ByKeypoints) -> Array:
-    """Log likelihood ratios (2^n,) of the states, where silhouette and keypoints contradict, (4).
+    """Log likelihood ratios (2^n,) of the states if silhouette and keypoints disagree, (4).
 
     Args:
-        of_track: (n,) of the cues at the modes.
-        share: of an image.
+        of_track: (n,) evidence of the cues at the modes.
+        share: a(dt) of the image.
         alone: the pose by keypoints.
     """
     own = of_track.copy()
@@ -215,12 +215,12 @@ def _divided(of_track: Array, share: float, alone: ByKeypoints) -> Array:
 
 
 def evidence_of(cue: str, misfit: Misfit, *, begun: bool = True) -> Array:
-    """Log likelihood ratios e_g of valid against not, (G,), equation (2), nats.
+    """Log likelihood ratios e_g of valid against invalid, (G,), equation (2), nats.
 
     Args:
-        cue: by name, or the outline.
+        cue: name of the cue, or of the outline.
         misfit: of its groups.
-        begun: whether there was an image before.
+        begun: whether the track started before this image.
     """
     certainty = np.minimum(misfit.counts / VALIDITY_COUNT, 1.0)
     e = np.asarray(VALIDITY_NATS * certainty * (UNDECIDED[cue] - misfit.shares))

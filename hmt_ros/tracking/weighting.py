@@ -5,18 +5,18 @@
     n_k = sum_l t(x_k, x_l)                                                                     (2)
     log t(x, x_j) = -nu/2 log(1 + D(x, f(x_j)) / (nu q dt))                                     (3)
 
-x_j are the modes of the image before and f(x_j) where the dynamics move them; D is the mean squared
-distance of the joints, seen from the pelvis, and q the mean squared distance by which people leave
-their prediction in a second. Every hypothesis is a continuation of every mode, as far as a body can
-move in dt: which proposal it came from does not enter. A mode goes on as one of the hypotheses of
-the image (2), or ends, if all of them are less likely than e^-c. Hypotheses are where the search
-looked, and their number is no evidence: n_k counts those about x_k, or a motion with many copies
+x_j are the modes of the previous image and f(x_j) their predictions by the dynamics; D is the mean
+squared distance of the joints relative to the pelvis, and q the mean squared distance by which
+people leave their prediction in a second. Every hypothesis may continue every mode, as far as a
+body can move in dt, whatever its proposal. A mode continues as one of the hypotheses of the image
+(2), or ends, if all of them are less likely than e^-c. The number of hypotheses depends on the
+search and is no evidence: n_k counts those near x_k, because otherwise a motion with many copies
 would draw weight from another that was found once. E_g is the energy of cue g, of which an image
 adds the share a_g (`inference.error_model`).
 
 The normaliser |S_k|^(1/2) of a mode is left out, as in the paper: the Hessian shows how well the
-image fixes a pose, so a badly fixed one (in depth, or with a limb behind the trunk) would gain
-weight by being unseen.
+image determines a pose, so a badly determined one (in depth, or with a limb behind the trunk) would
+gain weight by being unseen.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Transition(NamedTuple):
     """Student's density of the mean squared distance of joints, for the core.
 
     Attributes:
-        variance: by which people leave their prediction meanwhile, m^2.
+        variance: q dt, m^2.
         tails: nu.
     """
 
@@ -48,11 +48,11 @@ class Transition(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Continuity:
-    """The motion prior on every transition from the modes of an image to the next one.
+    """Transition densities from the modes of an image to hypotheses of the next one.
 
     Attributes:
         body: of the poses.
-        predicted: (K, d) poses that the modes are moved to.
+        predicted: (K, d) predicted poses of the modes.
         log_weights: (K,) of the modes.
         dt: time between the images, s.
     """
@@ -78,7 +78,7 @@ class Continuity:
         return result
 
     def rated(self, joints: Array) -> Array:
-        """log sum_k w_k t(x_n, x_k), (N,), of poses with joints: how well each alone goes on."""
+        """Log predictive density log sum_k w_k t(x_n, x_k), (N,), of poses with joints."""
         rates = self.log_weights[:, None] + self.log_transitions(joints)
         return np.asarray(log_sum_exp(rates, axis=0), dtype=np.float64)
 
@@ -100,14 +100,14 @@ def normalised(log_weights: Array) -> Array:
 
 
 def at_least(log_weights: Array, least: float) -> Array:
-    """Normalised log weights (N,), those below `least` raised to it: a mode that may come back."""
+    """Normalised log weights (N,), raised to `least` so that a mode may recover."""
     return normalised(np.maximum(log_weights, least))
 
 
 def pooled_origins(histories: Array, log_weights: Array, owner: Index) -> Array:
-    """Probability (M, K) that each kept mode comes from mode k of the image before.
+    """Probability (M, K) that each kept mode continues mode k of the previous image.
 
-        P(k | m) = sum_n w_n P(k | x_n) / sum_n w_n,    over the hypotheses n that m stands for
+        P(k | m) = sum_n w_n P(k | x_n) / sum_n w_n,    over the hypotheses n that m represents
         P(k | x_n) = w_k p(x_n | x_k) / sum_j w_j p(x_n | x_j)
 
     The evidence of the image is a factor of w_n alone, and cancels in P(k | x_n).
@@ -115,7 +115,7 @@ def pooled_origins(histories: Array, log_weights: Array, owner: Index) -> Array:
     Args:
         histories: (K, N) log w_k p(x_n | x_k).
         log_weights: (N,).
-        owner: (N,) the kept mode that stands for each hypothesis, 0 to M - 1.
+        owner: (N,) the kept mode that represents each hypothesis, 0 to M - 1.
     """
     origins = elementary.exp(histories - log_sum_exp(histories, axis=0))
     shares = elementary.exp(log_weights - log_weights.max())

@@ -1,1 +1,1 @@
-"""Bags in and out: MCAP and SQLite files, metadata, videos."""
+"""Reading and writing of bags: MCAP and SQLite files, metadata, videos."""

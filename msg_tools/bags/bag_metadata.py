@@ -1,4 +1,4 @@
-"""`metadata.yaml`, which makes a folder a bag of rosbag2, names of topics, and `BagError`."""
+"""The `metadata.yaml` of a rosbag2 bag, names of topics, and `BagError`."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ SUFFIXES = ('.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 VERSION = 9
 MAX_BYTES = 2**19
 
-# No deadline, no lifespan: rmw writes this for an infinite duration.
+# Infinite duration as rmw writes it, for no deadline and no lifespan.
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
 
 
 class BagError(ValueError):
-    """A bag that can not be read or written, in one line: what was seen, wanted, and what to do."""
+    """A bag can not be read or written; one line with the fault and the remedy."""
 
     def __init__(self, text: str) -> None:
         super().__init__(one_line(text))
@@ -38,7 +38,7 @@ def absolute_name(topic: str, namespace: str = '') -> str:
     """Name of a topic as rosbag2 records and compares it: with its namespace and a leading slash.
 
     Args:
-        topic: a relative name is in the namespace; an absolute one stays.
+        topic: name; a relative name is in the namespace, an absolute name stays unchanged.
         namespace: '/humans/bodies/p1' for example; '' for the root.
     """
     if topic.startswith('/'):
@@ -51,13 +51,13 @@ def read_file_names(folder: Path) -> list[str]:
     """Names of the files of a bag, in order.
 
     Raises:
-        BagError: no metadata, or not that of a bag.
+        BagError: the metadata are missing or not those of a bag.
     """
     path = folder / FILE_NAME
     if not path.is_file():
         raise BagError(
             f'{folder} is no bag: it has no {FILE_NAME}; give the .mcap file itself, or write '
-            'the metadata anew with `ros2 bag reindex`'
+            'the metadata again with `ros2 bag reindex`'
         )
     try:
         document = read_plain_yaml(path, MAX_BYTES)
@@ -68,8 +68,8 @@ def read_file_names(folder: Path) -> list[str]:
     except (TypeError, LookupError):
         names = None
     if not names or not isinstance(names, list) or not all(isinstance(x, str) for x in names):
-        raise BagError(f'{path} names no files of a bag; `ros2 bag reindex` writes it anew')
-    # The first versions wrote the paths relative to the parent of the folder.
+        raise BagError(f'{path} names no files of a bag; `ros2 bag reindex` writes it again')
+    # The first versions of rosbag2 wrote paths relative to the parent of the folder.
     names = [PurePosixPath(name).name for name in names]
     if len(set(names)) < len(names):
         raise BagError(f'{path} names a file twice')
@@ -77,7 +77,7 @@ def read_file_names(folder: Path) -> list[str]:
 
 
 def quality_of_service(latched: bool) -> list[dict[str, Any]]:
-    """Offered QoS of a topic: reliable, all kept; latched topics are for late joiners too."""
+    """Offered QoS of a topic: reliable; a latched topic is also transient local."""
     return [
         {
             'history': 'keep_last',
@@ -94,6 +94,6 @@ def quality_of_service(latched: bool) -> list[dict[str, Any]]:
 
 
 def as_yaml(document: Any) -> str:
-    """YAML text, the same for the same document."""
+    """YAML text of a document; equal documents give equal text."""
     text: str = yaml.safe_dump(document, sort_keys=False, default_flow_style=False, width=2**31)
     return text

@@ -1,9 +1,9 @@
-"""Reads a bag: a folder of rosbag2, or a single .mcap or .db3 file, also compressed with zstd.
+"""Reads a bag: a rosbag2 folder, or a single .mcap or .db3 file, also compressed with zstd.
 
-Messages come in the order of their log times; messages of equal times come in the order of the
-files. Memory holds the chunks of the present time, never a whole file. Every fault of a bag is a
-`BagError` of one line. A bag that a crash cut off is read up to its last complete message, and a
-line of the log says so.
+Messages are in the order of their log times, and those of equal times in the order of the files.
+Memory contains the chunks of the current time, never a whole file. Every fault of a bag raises a
+`BagError` of one line. A bag that was cut off by a crash is read up to its last complete message,
+with a warning in the log.
 
     with BagReader('walk') as bag:
         topic = bag.find_topic(['sensor_msgs/msg/CompressedImage'])
@@ -48,7 +48,7 @@ Content = TypeVar('Content')
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
 _OURS = 'hmt_msgs/'
-# Definitions of the messages of one topic, and names in a line.
+# Maximum number of definitions of the messages of one topic, and of names in a line.
 _MOST_DEFINITIONS, _MOST_NAMES = 4, 20
 _PIECE = 2**20
 
@@ -58,10 +58,10 @@ class Topic:
     """A topic of a bag.
 
     Attributes:
-        name: as written in the bag, with or without a leading slash.
-        msgtype: for example 'sensor_msgs/msg/Image'; '' if the bag does not contain it.
-        encoding: of the messages; 'cdr' for ROS 2.
-        message_count: how many there are, by the statistics of the bag.
+        name: name as in the bag, with or without a leading slash.
+        msgtype: type, for example 'sensor_msgs/msg/Image'; '' if the bag does not contain it.
+        encoding: encoding of the messages; 'cdr' for ROS 2.
+        message_count: number of messages according to the statistics of the bag.
     """
 
     name: str
@@ -72,13 +72,13 @@ class Topic:
 
 @dataclass(frozen=True)
 class BagMessage:
-    """A message of a bag, still as bytes until `message` is asked for.
+    """A message of a bag; its bytes are deserialised when `message` is first used.
 
     Attributes:
-        path: of the bag.
-        topic: as written in the bag.
-        msgtype: for example 'sensor_msgs/msg/Image'.
-        log_time_ns: when it was recorded.
+        path: path of the bag.
+        topic: name of the topic as in the bag.
+        msgtype: type, for example 'sensor_msgs/msg/Image'.
+        log_time_ns: time of the recording.
         data: CDR bytes, as stored.
     """
 
@@ -94,16 +94,16 @@ class BagMessage:
         """The message, with the fields of its type; arrays are read-only.
 
         Raises:
-            BagError: its bytes do not fit its type, or the type is not known.
+            BagError: the bytes do not match the type, or the type is unknown.
         """
         return self._deserialise(self)
 
     def content(self, read: Callable[[Any], Content]) -> Content:
-        """What a function reads in the message.
+        """Returns the result of a function of the message.
 
         Raises:
-            ValueError: the bytes do not fit the type, or the function says so; one line, with the
-                place in the bag.
+            ValueError: the bytes do not match the type, or the function raises it; one line with
+                the place in the bag.
         """
         message = self.message
         try:
@@ -113,7 +113,7 @@ class BagMessage:
             raise ValueError(f'{where}: {error}') from error
 
     def with_message(self, message: Any) -> BagMessage:
-        """Another message of `rosbags` in the place of this one; it has no bytes."""
+        """Replaces the message by another of `rosbags`, without bytes."""
         kind = message.__msgtype__
         return BagMessage(self.path, self.topic, kind, self.log_time_ns, b'', lambda _: message)
 
@@ -125,12 +125,12 @@ class BagReader(AbstractContextManager['BagReader']):
         path: folder with metadata.yaml, or a file.
 
     Raises:
-        BagError: not a bag, or nothing of it can be read.
+        BagError: not a bag, or no part of it can be read.
 
     Attributes:
-        path: as given.
-        topics: by name, in the order of the bag.
-        cut_off: the files of which the end is missing, as a recorder that is killed leaves them.
+        path: path of the bag, as given.
+        topics: topics by name, in the order of the bag.
+        cut_off: files whose end is missing because the recorder was killed.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -168,7 +168,7 @@ class BagReader(AbstractContextManager['BagReader']):
             _tell_cut_off(name)
 
     def close(self) -> None:
-        """Removes the files that were decompressed into the folder for temporary files."""
+        """Removes the temporary files with decompressed content."""
         self._scratch.close()
 
     def __exit__(self, *_: object) -> None:
@@ -188,13 +188,13 @@ class BagReader(AbstractContextManager['BagReader']):
         return [x for x in self.topics.values() if x.msgtype in msgtypes and x.message_count]
 
     def topic(self, name: str) -> Topic:
-        """The topic of a name, with or without its leading slash.
+        """The topic with a name, with or without its leading slash.
 
-        A relative name that is not there means the topic of that name in a namespace, if only one
-        namespace has it.
+        A relative name that does not exist in the root selects the topic of that name in a
+        namespace, if only one namespace has it.
 
         Raises:
-            BagError: there is none, or several namespaces have it.
+            BagError: no namespace or several namespaces have it.
         """
         for candidate in (name, f'/{name}', name.removeprefix('/')):
             if candidate in self.topics:
@@ -207,14 +207,14 @@ class BagReader(AbstractContextManager['BagReader']):
         raise BagError(f'{self.path} has no topic {name}; it has {self._topic_names()}')
 
     def find_topic(self, msgtypes: Iterable[str], name: str | None = None) -> Topic:
-        """The one topic of some types.
+        """The only topic of some types, or the topic with a name.
 
         Args:
-            msgtypes: types that will do.
-            name: of the topic, where several have such a type; None when there is only one.
+            msgtypes: accepted types.
+            name: name of the topic, needed if several topics have such a type; None otherwise.
 
         Raises:
-            BagError: no topic, several topics, another type, no message.
+            BagError: no topic, several topics, another type, or no message.
         """
         wanted = list(msgtypes)
         short = ' or '.join(msgtype.rpartition('/')[2] for msgtype in wanted)
@@ -241,14 +241,14 @@ class BagReader(AbstractContextManager['BagReader']):
         return topic
 
     def messages(self, topics: Iterable[str] | None = None) -> Iterator[BagMessage]:
-        """Messages by log time, then by place in the bag.
+        """Yields messages by log time, then by position in the bag.
 
         Args:
-            topics: names, with or without leading slash; None for all.
+            topics: names of topics, with or without leading slash; None for all topics.
 
         Raises:
-            BagError: no such topic, a topic that is not CDR or of two types; where the bag is
-                damaged, after the messages before the damage.
+            BagError: no such topic, or a topic is not CDR or has two types; or the bag is damaged,
+                which is raised after the messages before the damage.
         """
         if topics is None:
             return self._merged(self.topics)
@@ -292,13 +292,13 @@ class BagReader(AbstractContextManager['BagReader']):
                     channel.definition_encoding,
                     channel.definition,
                 )
-            # Bags with the compression mode "message". No CDR message starts like this.
+            # Compression mode "message" of a bag; no CDR message starts with these bytes.
             if data[:4] == _ZSTD_MAGIC:
                 data = b''.join(_decompressed(data, budget, LARGEST))
             message = deserialise(data, stored.msgtype, store, budget)
             return adopted(message, store) if stored.msgtype.startswith(_OURS) else message
         except Exception as error:
-            # Bytes from outside meet generated code here, which does not say what it may raise.
+            # Generated code reads untrusted bytes here, and its exceptions are not documented.
             raise BagError(
                 f'{what} can not be read as {stored.msgtype or "unknown type"}: {reason(error)}'
             ) from error
@@ -350,7 +350,7 @@ class BagReader(AbstractContextManager['BagReader']):
         raise BagError(f'{name} is not a bag: it {seen}, wanted an MCAP or SQLite recording')
 
     def _decompressed(self, path: Path, budget: Budget) -> Path:
-        """The content of a zstd file, as a file that lives as long as the reader."""
+        """The content of a zstd file in a temporary file, which `close` removes."""
         folder = self._scratch.enter_context(tempfile.TemporaryDirectory(prefix='bag_reader.'))
         target = Path(folder) / path.stem
         with path.open('rb') as compressed, target.open('wb') as plain:
@@ -360,7 +360,7 @@ class BagReader(AbstractContextManager['BagReader']):
 
 @cache
 def _tell_cut_off(name: str) -> None:
-    """A line in the log, once for each file: a command opens a bag several times."""
+    """Logs a warning once per file, because a command opens a bag several times."""
     _log.warning(
         '%s breaks off: it is read up to its last complete message; `mcap recover` makes a whole '
         'file of it, and `ros2 bag reindex` the metadata of its folder',
@@ -374,13 +374,13 @@ def _first_bytes(path: Path) -> bytes:
 
 
 def _decompressed(packed: bytes | BinaryIO, budget: Budget, largest: int) -> Iterator[bytes]:
-    """Content of zstd frames, in pieces; each is spent before it is used.
+    """Yields the content of zstd frames in pieces, and charges each piece to the budget.
 
     Args:
-        largest: bytes that it may have.
+        largest: maximum size of the content, bytes.
 
     Raises:
-        BudgetError: it is larger than that, or than the budget allows.
+        BudgetError: the content exceeds this size or the budget.
     """
     with zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True) as stream:
         while piece := stream.read(_PIECE):
@@ -392,7 +392,7 @@ def _decompressed(packed: bytes | BinaryIO, budget: Budget, largest: int) -> Ite
 
 
 def _listed(names: Collection[str]) -> str:
-    """Names for a message."""
+    """Names as text for an error message."""
     more = f' and {len(names) - _MOST_NAMES} more' if len(names) > _MOST_NAMES else ''
     return ', '.join(islice(names, _MOST_NAMES)) + more
 
@@ -400,12 +400,12 @@ def _listed(names: Collection[str]) -> str:
 def _from_its_start(
     file: McapFile | SqliteFile, topics: Collection[str], budget: Budget
 ) -> Iterator[StoredMessage]:
-    """A mark without a channel, then the messages: no file is opened before its time has come."""
+    """Yields a mark at the first log time, then the messages; opens the file after the mark."""
     yield StoredMessage(file.start, None, b'')
     yield from file.messages(topics, budget)
 
 
 def _full_name(msgtype: str) -> str:
-    """Name of a type with its middle part, which older recorders left out."""
+    """Name of a type with its middle part, which older recorders omitted."""
     package, slash, name = msgtype.partition('/')
     return f'{package}/msg/{name}' if slash and '/' not in name else msgtype

@@ -1,13 +1,13 @@
-"""Writes messages into a bag that rosbag2 plays, as a whole or not at all.
+"""Writes messages into a bag that rosbag2 plays, completely or not at all.
 
-Topics have absolute names, because rosbag2 compares names as they are written: a relative name is
-in the namespace of the bag, as the one of a node is in the node's. Log time and publish time are
-both the stamp that the caller gives.
+Topics have absolute names, because rosbag2 compares names literally. A relative name is resolved in
+the namespace of the bag, as a node resolves it in its own. Log time and publish time are both the
+stamp given by the caller.
 
-The bag is written into a hidden folder `.<name>.<random>.partial` next to its place and moved there
-when it is complete and on the disk; an error removes it. If the process is killed the hidden folder
-stays: each complete chunk is handed to the system at once, so that its file can be read but for the
-last one. Chunks, data and summary have checksums. The same calls write the same bytes.
+The bag is written into a hidden folder `.<name>.<random>.partial` next to its place, and moved when
+it is complete and on the disk; an error removes it. If the process is killed the hidden folder
+stays; each complete chunk is flushed at once, so that its file can be read except for the last
+chunk. Chunks, data and summary have checksums. The same calls write the same bytes.
 
     with BagWriter('out') as bag:
         bag.add_topic('body', 'hmt_msgs/msg/Body', latched=True)
@@ -46,12 +46,12 @@ _FOLDER = FolderKind('a bag', FILE_NAME, tuple(f'*{suffix}' for suffix in SUFFIX
 
 
 class _Dropped(Exception):
-    """Ends a folder that is not to come to its place."""
+    """Ends a new folder without moving it to its place."""
 
 
 @dataclass
 class _Topic:
-    """A topic of the bag: the number of its channel, and what metadata.yaml says of it."""
+    """A topic of the bag: the number of its channel, and its entries in metadata.yaml."""
 
     msgtype: str
     channel: int
@@ -61,15 +61,15 @@ class _Topic:
 
 
 class BagWriter(AbstractContextManager['BagWriter']):
-    """A bag that is open for writing; a context manager, which closes it, or drops it on an error.
+    """A bag that is open for writing; the context manager closes it, or drops it on an error.
 
     Args:
         path: folder to write, `<name>`; the file in it is `<name>.mcap`.
-        overwrite: replace a bag that is there. Anything else that is there is never touched.
-        namespace: of the topics with relative names, '/humans/bodies/p1' for example.
+        overwrite: whether to replace an existing bag; other files and folders are never replaced.
+        namespace: namespace of topics with relative names, '/humans/bodies/p1' for example.
 
     Raises:
-        BagError: the folder exists, can not be created or written.
+        BagError: the folder exists, or can not be created or written.
     """
 
     def __init__(
@@ -106,15 +106,15 @@ class BagWriter(AbstractContextManager['BagWriter']):
             self.abort()
 
     def add_topic(self, name: str, msgtype: str, *, latched: bool = False) -> None:
-        """Announces a topic; one that is written without is not latched.
+        """Adds a topic; `write` also adds unknown topics, which are not latched.
 
         Args:
-            name: of the topic, absolute or relative to the namespace.
-            msgtype: for example 'hmt_msgs/msg/PoseMixture'.
-            latched: offered as transient local, so that late subscribers get the last message.
+            name: name of the topic, absolute or relative to the namespace.
+            msgtype: type, for example 'hmt_msgs/msg/PoseMixture'.
+            latched: whether the QoS is transient local: late subscribers get the last message.
 
         Raises:
-            BagError: an unknown type, or the topic is there already.
+            BagError: the type is unknown, or the topic exists.
         """
         store, name = typestore(), absolute_name(name, self._namespace)
         if msgtype not in store.fielddefs:
@@ -133,10 +133,10 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self._topics[name] = _Topic(msgtype, channel, offered, type_hash)
 
     def write(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Writes a message of `typestore()`; announces its topic where that has not been done.
+        """Writes a message of `typestore()`; adds its topic if needed.
 
         Raises:
-            BagError: the topic has another type, a field does not fit the type, the disk is full.
+            BagError: the topic has another type, a field is invalid, or the disk is full.
         """
         msgtype, topic = message.__msgtype__, absolute_name(topic, self._namespace)
         if topic not in self._topics:
@@ -148,17 +148,17 @@ class BagWriter(AbstractContextManager['BagWriter']):
         try:
             data = serialise(message)
         except Exception as error:
-            # Generated code of the library, which does not say what it may raise for a wrong field.
+            # Generated code of the library; its exceptions for invalid fields are not documented.
             raise BagError(
                 f'{self.path}: message of {topic} does not fit {msgtype}: {reason(error)}'
             ) from error
         self.write_serialised(topic, stamp_ns, data)
 
     def write_serialised(self, topic: str, stamp_ns: int, data: bytes) -> None:
-        """Writes a message that is CDR bytes already, of a topic that has been announced.
+        """Writes a message given as CDR bytes; its topic must have been added.
 
         Raises:
-            BagError: no such topic, a stamp before 1970, the disk is full.
+            BagError: no such topic, a stamp before 1970, or the disk is full.
         """
         topic = absolute_name(topic, self._namespace)
         known = self._topics.get(topic)
@@ -171,16 +171,16 @@ class BagWriter(AbstractContextManager['BagWriter']):
         assert self._file is not None
         with self._dropping_on_error():
             self._writer.add_message(known.channel, stamp_ns, data, stamp_ns)
-            self._file.flush()  # the system keeps it should the process be killed
+            self._file.flush()  # keeps the data if the process is killed
         known.message_count += 1
         self._start = stamp_ns if self._start is None else min(self._start, stamp_ns)
         self._end = max(self._end, stamp_ns)
 
     def close(self) -> None:
-        """Completes the bag and moves it to its place; does nothing when that has been done.
+        """Completes the bag and moves it to its place, unless it is already closed.
 
         Raises:
-            BagError: the disk is full, or the place is taken meanwhile; nothing is left behind.
+            BagError: the disk is full, or its place is occupied by now; all files are removed.
         """
         if self._file is None or self._file.closed:
             return
@@ -200,9 +200,9 @@ class BagWriter(AbstractContextManager['BagWriter']):
             _sync_folder(self.path.parent)
 
     def abort(self) -> None:
-        """Drops everything that was written."""
+        """Removes all that was written."""
         if self._file is not None:
-            # Closing writes the buffer, and fails again on a full disk: nothing is to be saved.
+            # Closing writes the buffer and may fail again on a full disk, which is harmless here.
             with suppress(OSError):
                 self._file.close()
         with suppress(_Dropped), self._place:
@@ -214,7 +214,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
 
     @contextmanager
     def _dropping_on_error(self) -> Iterator[None]:
-        """Removes the unfinished bag when an exception passes, and turns OSError into BagError."""
+        """Removes the bag on an exception; turns OSError and ValueError into BagError."""
         if self._file is not None and self._file.closed:
             raise BagError(f'{self.path} is closed')
         try:
@@ -230,7 +230,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             raise
 
     def _information(self) -> dict[str, Any]:
-        """Content of metadata.yaml, as rosbag2 of Jazzy writes it."""
+        """Content of metadata.yaml, in the form of rosbag2 in ROS 2 Jazzy."""
         start = 2**63 - 1 if self._start is None else self._start
         span = {
             'duration': {'nanoseconds': max(0, self._end - start)},

@@ -1,11 +1,10 @@
 """An MCAP file of a bag.
 
-A file that its recorder did not complete is read up to its last complete message: a pass over it
-makes the index that is missing. Checksums of chunks are compared where the file has them. Lengths
-are compared with what is there, and spent from a budget, before memory is; attachments are not
-read.
+An incomplete file is read up to its last complete message; a pass over the file makes the missing
+index. Checksums of chunks are verified if the file has them. Lengths are compared with the size of
+the file and charged to a budget before memory is allocated; attachments are not read.
 
-The format: https://mcap.dev/spec
+Format: https://mcap.dev/spec
 """
 
 from __future__ import annotations
@@ -39,30 +38,30 @@ from msg_tools.files.budget import Budget, BudgetError
 
 MAGIC = b'\x89MCAP0\r\n'
 
-# Opcode and length, which stand before every record; the records, as far as they are needed.
+# Opcode and length in front of every record, and the needed fields of some records.
 _RECORD = struct.Struct('<BQ')
 _MESSAGE = struct.Struct('<HIQQ')
 _CHUNK = struct.Struct('<16xQI')
 _FOOTER = struct.Struct('<B8xQ12x8s')
 _DESCRIPTIONS: dict[int, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: ChannelRecord}
 
-# Bytes of a summary, of a schema or channel, of records outside of chunks that are read at once,
-# and of the chunks that are open at a time; memory for each byte of a schema or channel.
+# Maximum size of a summary, of a schema or channel, of records outside of chunks that are read at
+# once, and of all open chunks, bytes; memory per byte of a schema or channel.
 _MAX_SUMMARY, _MAX_DESCRIPTION, _MAX_RUN, _MAX_OPEN = 2**25, 2**20, 2**20, 2**28 + 2**27
 _MEMORY = 16
-_SKIPPED = 8  # records that one counts for that is passed over: most of them are larger
+_SKIPPED = 8  # number of records that a skipped record counts as, since most are larger
 
 
 @dataclass
 class _Index:
-    """What is in a file, and where.
+    """The index of a file.
 
     Attributes:
-        schemas: by their keys.
-        channels: by their keys.
-        chunks: in the order of the file; also runs of records that are not in a chunk.
+        schemas: schemas by their keys.
+        channels: channels by their keys.
+        chunks: chunks in the order of the file, and runs of records outside of chunks.
         counts: number of messages of each channel, by its key.
-        fault: what ended the pass over the file; `EndOfFile`: the end is missing.
+        fault: exception that ended the pass over the file; `EndOfFile` if the end is missing.
     """
 
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -72,7 +71,7 @@ class _Index:
     fault: Exception | None = None
 
     def add(self, file: _File, offset: int, end: int, *, bare: bool) -> None:
-        """Takes in a chunk, or records outside of chunks, between two places of the file."""
+        """Adds a chunk, or records outside of chunks, between two offsets of the file."""
         counts: Counter[int] = Counter()
         start, whole = NEVER, 0
         data = file.content(offset, end)
@@ -92,14 +91,14 @@ class _Index:
         except EndOfFile as error:
             raise McapError('a record breaks off') from error
         finally:
-            # Of records outside of chunks, those before a fault stay.
+            # Records outside of chunks are kept up to a fault.
             if counts and (bare or whole == len(data)):
                 length = whole if bare else end - offset
                 self.chunks.append(ChunkIndex(length, offset, '', 0, 0, 0, {}, start, 0))
                 self.counts.update(counts)
 
     def describe(self, record: object) -> None:
-        """Takes in a schema or a channel."""
+        """Adds a schema or a channel."""
         if isinstance(record, Schema):
             self.schemas[record.id] = record
         elif isinstance(record, ChannelRecord):
@@ -107,16 +106,16 @@ class _Index:
 
 
 class McapFile:
-    """A file in the format MCAP.
+    """A file in the MCAP format.
 
     Args:
-        name: for messages to the user.
-        budget: of opening the bag.
+        name: name for messages to the user.
+        budget: budget for opening the bag.
 
     Attributes:
         counts: number of messages of each channel.
-        start: log time of the first message, ns, or an earlier time; `NEVER`: there is none.
-        cut_off: whether its end is missing.
+        start: lower bound of the log time of the first message, ns; `NEVER` without messages.
+        cut_off: whether the end of the file is missing.
     """
 
     def __init__(self, path: Path, name: str, budget: Budget) -> None:
@@ -124,7 +123,7 @@ class McapFile:
         with faults_told(name), path.open('rb') as opened:
             file = _File(opened, budget)
             index = None
-            with suppress(Exception):  # a pass over the file tells what is wrong
+            with suppress(Exception):  # a pass over the file finds the fault
                 index = _written_index(file)
             self._index = index or _index_of_a_pass(file)
         index = self._index
@@ -145,14 +144,14 @@ class McapFile:
             self.counts[channel] += index.counts[key]
 
     def messages(self, topics: Collection[str], budget: Budget) -> Iterator[StoredMessage]:
-        """Messages of some topics by log time, then by place in the file; marks between them.
+        """Yields messages of some topics, and marks, by log time, then by offset in the file.
 
         Args:
-            budget: of one pass over the bag.
+            budget: budget for one pass over the bag.
 
         Raises:
-            BagError: where the file is damaged, after the messages before the damage; where it
-                takes more than the budget.
+            BagError: the file is damaged, which is raised after the messages before the damage; or
+                it exceeds the budget.
         """
         wanted = {key for key, channel in self._channels.items() if channel.topic in topics}
         with faults_told(self.name), self._path.open('rb') as opened:
@@ -169,27 +168,27 @@ class McapFile:
 
 
 class _File:
-    """A file in one pass over it, which spends a budget.
+    """A file during one pass over it, which spends a budget.
 
     Attributes:
-        size: of the file, bytes.
-        budget: of the pass.
+        size: size of the file, bytes.
+        budget: budget of the pass.
     """
 
     def __init__(self, file: BinaryIO, budget: Budget) -> None:
         self._file, self.budget = file, budget
         self.size = os.fstat(file.fileno()).st_size
-        self._open = 0  # bytes of the chunks that are open
+        self._open = 0  # size of all open chunks, bytes
 
     def read(self, offset: int, end: int) -> bytes:
-        """Bytes of the file, all of them."""
+        """Reads the bytes between two offsets; raises EndOfFile if some are missing."""
         if end > self.size:
             raise EndOfFile(f'{end - self.size} bytes are missing after {self.size}')
         self._file.seek(offset)
         return self._file.read(end - offset)
 
     def records(self, data: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
-        """Opcodes of records, and where their contents start and end."""
+        """Yields opcode, and start and end of the content, of each record."""
         end, opcode, length = 0, 0, 0
         while end < len(data):
             self.budget.spend(records=1)
@@ -202,7 +201,7 @@ class _File:
             yield opcode, start, end
 
     def content(self, offset: int, end: int) -> bytes | memoryview:
-        """Records of a chunk, or those between two places of the file."""
+        """Records in the chunk, or outside of chunks, between two offsets of the file."""
         if end - offset > LARGEST + _MAX_RUN:
             raise McapError(f'a record of {end - offset} bytes')
         record = memoryview(self.read(offset, end))
@@ -228,7 +227,7 @@ class _File:
     def messages(
         self, chunk: ChunkIndex, channels: Mapping[int, Channel], wanted: Collection[int]
     ) -> Iterator[StoredMessage]:
-        """A mark, then the messages of a chunk: it is not opened before its time has come."""
+        """Yields a mark at the start time of a chunk, then reads it and yields its messages."""
         yield StoredMessage(chunk.message_start_time, None, b'')
         start = chunk.chunk_start_offset
         data = self.content(start, start + chunk.chunk_length)
@@ -256,7 +255,7 @@ class _File:
 
 
 def _unpacked(packed: memoryview, compression: bytes, size: int) -> bytes:
-    """Content of a chunk; no memory is used for more than its size."""
+    """Content of a chunk; allocates no memory beyond the given size."""
     whole = True
     if compression == b'zstd':
         known = zstandard.get_frame_parameters(packed).content_size
@@ -274,7 +273,7 @@ def _unpacked(packed: memoryview, compression: bytes, size: int) -> bytes:
 
 
 def _written_index(file: _File) -> _Index | None:
-    """The index at the end of a file; None: there is none, or not of all of the file."""
+    """The index at the end of a file; None if it is missing or incomplete."""
     end = file.size - _FOOTER.size
     opcode, summary, magic = _FOOTER.unpack(file.read(end, file.size))
     if opcode != Opcode.FOOTER or magic != MAGIC or not 0 < summary < end <= summary + _MAX_SUMMARY:
@@ -289,7 +288,7 @@ def _written_index(file: _File) -> _Index | None:
         elif isinstance(record, ChunkIndex):
             index.chunks.append(record)
             if record.chunk_start_offset < place:
-                return None  # a chunk twice
+                return None  # the same chunk twice
             place = record.chunk_start_offset + record.chunk_length
     if statistics is None or place > summary:
         return None
@@ -305,20 +304,20 @@ def _written_index(file: _File) -> _Index | None:
 
 
 def _index_of_a_pass(file: _File) -> _Index:
-    """The index of a file up to its end, or to where it breaks off or is damaged."""
+    """Makes the index of a file up to its end, or to the first missing or damaged byte."""
     index = _Index()
     try:
         for start, end, bare in _pieces(file):
             index.add(file, start, end, bare=bare)
     except BudgetError:
         raise
-    except Exception as error:  # noqa: BLE001 - told behind the messages before it
+    except Exception as error:  # noqa: BLE001 - raised after the messages before it
         index.fault = error
     return index
 
 
 def _pieces(file: _File) -> Iterator[tuple[int, int, bool]]:
-    """Where the chunks of a file are, and runs of records outside of chunks, which are marked."""
+    """Yields start and end of each chunk (False) and run of records outside of chunks (True)."""
     run = at = len(MAGIC)
     opcode = 0
     try:

@@ -1,7 +1,7 @@
 """A .db3 file of a bag, the default storage before ROS 2 Iron.
 
-The database is opened read-only, and only its tables are read: views, virtual tables and generated
-columns could compute without an end. What SQLite does for a query is limited by its steps.
+The database is opened read-only, and only its tables are read, because views, virtual tables and
+generated columns could compute endlessly. The number of steps of SQLite for a query is limited.
 """
 
 from __future__ import annotations
@@ -26,16 +26,17 @@ from msg_tools.messages.definitions import MAX_BYTES
 
 MAGIC = b'SQLite format 3\x00'
 
-# Steps of the virtual machine of SQLite for a file, and more for each of its bytes: a row, which
-# has more than ten bytes, takes about thirty. Bytes that SQLite may take in the whole process.
+# Maximum number of steps of the virtual machine of SQLite for a file, and more for each byte (a row
+# of more than ten bytes takes about thirty steps); steps between two checks; maximum memory of
+# SQLite in the whole process, bytes.
 _STEPS, _STEPS_PER_BYTE, _STEPS_AT_ONCE, _MEMORY = 10**7, 4, 10**5, 2**29
 
 
 class SqliteFile:
-    """A file of SQLite; see `McapFile`.
+    """An SQLite file; see `McapFile`.
 
     Args:
-        budget: of opening the bag.
+        budget: budget for opening the bag.
     """
 
     cut_off = False
@@ -46,7 +47,7 @@ class SqliteFile:
         self.counts: Counter[Channel] = Counter()
         self.start = NEVER
         with faults_told(name), _connected(path) as database:
-            # SQLite resolves all views to tell one table, in a time exponential in their number.
+            # SQLite resolves all views to describe one table, in time exponential in their number.
             if _mentions(database, 'view') or _mentions(database, 'virtual'):
                 raise sqlite3.DataError('it has views or virtual tables, wanted tables')
             definitions = {}
@@ -89,11 +90,11 @@ class SqliteFile:
 
 @contextmanager
 def _connected(path: Path) -> Iterator[sqlite3.Connection]:
-    """A database for reading, whose queries end."""
+    """Opens a database read-only, with limits on the time and memory of queries."""
     uri = f'{path.absolute().as_uri()}?mode=ro&immutable=1'
     with closing(sqlite3.connect(uri, uri=True, check_same_thread=False)) as database:
         steps = iter(range((_STEPS + _STEPS_PER_BYTE * path.stat().st_size) // _STEPS_AT_ONCE))
-        # True, when none is left, interrupts.
+        # The handler returns True to interrupt SQLite when no steps are left.
         database.set_progress_handler(lambda: next(steps, None) is None, _STEPS_AT_ONCE)
         database.execute('PRAGMA trusted_schema = OFF')
         database.execute(f'PRAGMA hard_heap_limit = {_MEMORY}')
@@ -101,13 +102,13 @@ def _connected(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _mentions(database: sqlite3.Connection, word: str) -> bool:
-    """Whether a statement of the schema has a word; the kinds in a schema may be forged."""
+    """Whether a statement of the schema contains a word; its column `type` may be forged."""
     query = 'SELECT 1 FROM sqlite_master WHERE CAST(sql AS TEXT) LIKE ?'
     return database.execute(query, (f'%{word}%',)).fetchone() is not None
 
 
 def _is_table(database: sqlite3.Connection, name: str) -> bool:
-    """Whether a name is that of a table with stored columns only, in a schema without views."""
+    """Whether a name is that of a table of stored columns; the schema must have no views."""
     columns = database.execute('SELECT hidden FROM pragma_table_xinfo(?)', (name,)).fetchall()
     return bool(columns) and not any(hidden for (hidden,) in columns)
 
@@ -115,7 +116,7 @@ def _is_table(database: sqlite3.Connection, name: str) -> bool:
 def _rows(
     database: sqlite3.Connection, query: str, kinds: tuple[type, ...], budget: Budget
 ) -> Iterator[Any]:
-    """Rows of a query, each of which is spent; SQLite itself stores any kind in any column."""
+    """Yields rows of a query after a check of their types, which SQLite does not enforce."""
     for row in database.execute(query):
         budget.spend(records=1)
         if tuple(map(type, row)) != kinds:

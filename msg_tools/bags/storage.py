@@ -1,4 +1,4 @@
-"""What the files of a bag have in common, whatever their format."""
+"""Common parts of the readers of MCAP and SQLite files."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import NamedTuple
 from msg_tools.bags.bag_metadata import BagError, reason
 from msg_tools.files.budget import BudgetError
 
-# Bytes of a message or a chunk: the largest images that are read have 2**26 pixels, uncompressed.
+# Maximum size of a message or a chunk, bytes; the largest accepted images have 2**26 pixels.
 LARGEST = 2**28
 NEVER = 2**64  # later than any log time
-MAX_TOPICS = 2**16  # of a bag, those of each file counted; a file of MCAP has no more
+MAX_TOPICS = 2**16  # maximum number of topics, summed over the files of a bag; the limit of MCAP
 
 
 class Channel(NamedTuple):
     """Description of the messages of one topic in a file.
 
     Attributes:
-        topic: as written, with or without a leading slash.
-        msgtype: as written; '' if the file does not contain it.
-        encoding: 'cdr' for ROS 2.
-        definition_encoding: 'ros2msg' for the text of a .msg file; '' when there is no definition.
+        topic: name as in the file, with or without a leading slash.
+        msgtype: type as in the file; '' if the file does not contain it.
+        encoding: encoding of the messages; 'cdr' for ROS 2.
+        definition_encoding: 'ros2msg' for the text of a .msg file; '' without a definition.
         definition: text of the message definition.
     """
 
@@ -34,7 +34,7 @@ class Channel(NamedTuple):
 
 
 class StoredMessage(NamedTuple):
-    """A message as it lies in the file, with its log time, ns; without a channel, a mark."""
+    """A message as stored, with its log time, ns; one without a channel is only a mark."""
 
     log_time: int
     channel: Channel | None
@@ -43,7 +43,7 @@ class StoredMessage(NamedTuple):
 
 @contextmanager
 def faults_told(name: str) -> Iterator[None]:
-    """Turns what the libraries raise, which do not say what that may be, into BagError."""
+    """Turns any exception into a BagError, because libraries do not document theirs."""
     try:
         yield
     except OSError as error:

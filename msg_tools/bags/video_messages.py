@@ -1,7 +1,7 @@
-"""Videos in bags: H.264 and the like, a packet per message, as images.
+"""Decodes videos in bags (H.264 and others, one packet per message) to images.
 
-The messages are sensor_msgs/CompressedImage or foxglove_msgs/CompressedVideo. PyAV decodes them,
-which is imported here only, and only where a bag has such a video.
+The messages are sensor_msgs/CompressedImage or foxglove_msgs/CompressedVideo. PyAV decodes them; it
+is imported only here, and only if a bag has such a video.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from msg_tools.messages.message_types import RosbagsMessages
 
 VIDEO_TYPE = 'foxglove_msgs/msg/CompressedVideo'
 _TYPES = ('sensor_msgs/msg/CompressedImage', VIDEO_TYPE)
-_MOST_WAITING = 32  # packets whose pictures have not come; more have none
-# Name of the decoder by the format that a message names.
+_MOST_WAITING = 32  # maximum number of packets without a picture so far
+# Name of the decoder by the format in a message.
 _CODECS = {'h264': 'h264', 'h265': 'hevc', 'hevc': 'hevc', 'vp9': 'vp9', 'av1': 'av1'}
 
 
@@ -30,23 +30,24 @@ def is_video(bag: BagReader, topic: Topic) -> bool:
     """Whether the first message of a topic belongs to a video.
 
     Raises:
-        BagError: it does, and PyAV is not installed.
+        BagError: it belongs to a video, and PyAV is not installed.
     """
     if topic.msgtype not in _TYPES or not topic.message_count:
         return False
     try:
         codec = _codec_of(next(bag.messages([topic.name])).message)
     except (BagError, StopIteration):
-        return False  # who reads the images reports the damage
+        return False  # the reader of the images reports the damage
     if codec is not None:
         _library(topic.name, codec)
     return codec is not None
 
 
 def with_pictures(messages: Iterator[BagMessage], topic: str) -> Iterator[BagMessage]:
-    """Messages in which each packet of the videos of a topic is a sensor_msgs/Image, bgr8.
+    """Replaces each video packet on a topic by a sensor_msgs/Image, bgr8.
 
-    Packets before the first key frame, and damaged ones, are left out. Other messages stay.
+    Packets before the first key frame and damaged packets are left out. Other messages are
+    unchanged.
 
     Raises:
         BagError: no packet could be decoded, or PyAV is not installed.
@@ -55,7 +56,7 @@ def with_pictures(messages: Iterator[BagMessage], topic: str) -> Iterator[BagMes
     for stored in messages:
         codec = None
         if stored.topic == topic and stored.msgtype in _TYPES:
-            with suppress(BagError):  # who takes the message reports it
+            with suppress(BagError):  # the receiver of the message reports it
                 codec = _codec_of(stored.message)
         if codec is None:
             yield stored
@@ -84,22 +85,22 @@ def _library(topic: str, codec: str) -> Any:
 
 
 class _Video:
-    """The decoder of a topic.
+    """The video decoder of a topic.
 
     Attributes:
         count: number of packets so far.
-        started: whether a key frame has come.
+        started: whether a key frame was decoded.
     """
 
     def __init__(self, topic: str, codec: str) -> None:
         self._av = _library(topic, codec)
         self._decoder = self._av.CodecContext.create(codec, 'r')
         self._decoder.options = {'max_pixels': str(MAX_PIXELS)}
-        self._packets: dict[int, BagMessage] = {}  # whose pictures have not come
+        self._packets: dict[int, BagMessage] = {}  # packets without a picture so far
         self.count, self.started = 0, False
 
     def pictures(self, stored: BagMessage | None) -> Iterator[BagMessage]:
-        """The pictures that a packet completes; None: there are no more."""
+        """Yields the pictures that a packet completes; None ends the video."""
         packet = None
         if stored is not None:
             packet = self._av.Packet(np.asarray(stored.message.data, dtype=np.uint8).tobytes())

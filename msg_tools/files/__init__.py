@@ -1,1 +1,1 @@
-"""Files from outside, read safely, and folders written whole; imports nothing of ours."""
+"""Safe reading of untrusted files, and atomic writing of folders; imports no other package here."""

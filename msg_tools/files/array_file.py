@@ -1,7 +1,7 @@
-"""Reads archives of plain arrays (.npz) from outside, up to an agreed size.
+"""Reads untrusted archives of plain arrays (.npz) up to a maximum size.
 
 Nothing is unpickled. A compressed archive could expand to any size, and the header of an array
-could claim any size: both are checked before memory is allocated. Arrays of objects are refused.
+could claim any size; both are checked before memory is allocated. Arrays of objects are refused.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from msg_tools.files.bounded_file import open_regular
 from msg_tools.files.budget import Budget
 from msg_tools.files.error_line import error_line
 
-# Bytes of all arrays of an archive together.
+# Maximum total size of the arrays of an archive, bytes.
 LARGEST_ARCHIVE = 2**29
 _MOST_ARRAYS = 10_000
 _KINDS = 'biufSU'
-_SMALLEST = 4  # bytes that a number counts at least
-_LONGEST = 10**6  # side of an array that has no bytes
+_SMALLEST = 4  # minimum number of bytes that a number counts as
+_LONGEST = 10**6  # maximum side of an array without bytes
 _HEADS = {
     (1, 0): array_format.read_array_header_1_0,
     (2, 0): array_format.read_array_header_2_0,
 }
-# Exceptions that damaged archives lead to, besides OSError and ValueError.
+# Exceptions that damaged archives cause, besides OSError and ValueError.
 _FAULTS = (
     zipfile.BadZipFile,
     zipfile.LargeZipFile,
@@ -48,20 +48,20 @@ _FAULTS = (
     SyntaxError,
     TypeError,
     OverflowError,
-    tokenize.TokenError,  # numpy reads the heads of old versions as Python
+    tokenize.TokenError,  # numpy parses headers of old versions as Python
 )
 
 
 def read_archive(path: str | Path, largest: int = LARGEST_ARCHIVE) -> dict[str, NDArray[Any]]:
-    """The arrays of an archive by name.
+    """Reads the arrays of an archive, by name.
 
     Args:
-        largest: bytes that they may have together.
+        largest: maximum total size of the arrays, bytes.
 
     Raises:
-        OSError: a file that can not be read.
-        ValueError: no archive, a damaged one, one with objects in it, or one that is too large; one
-            line, without the path.
+        OSError: the file can not be read.
+        ValueError: the file is no archive, is damaged or too large, or contains objects; one line,
+            without the path.
     """
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
@@ -82,7 +82,7 @@ def read_archive(path: str | Path, largest: int = LARGEST_ARCHIVE) -> dict[str, 
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, largest: int) -> NDArray[Any]:
-    """An array of an archive, whose head is compared with the bytes that are there."""
+    """Reads an array of an archive; its header is first compared with its number of bytes."""
     name, there = member.filename, member.file_size
     with archive.open(member) as file:
         read_head = _HEADS.get(array_format.read_magic(file))
@@ -91,7 +91,7 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, largest: int) -> N
         shape, _, dtype = read_head(file)
         if dtype.kind not in _KINDS:
             raise ValueError(f'the array {name} holds {str(dtype)[:40]}, wanted numbers or texts')
-        # Numbers of one byte become larger ones.
+        # Callers convert numbers of one byte to larger types.
         claimed = math.prod(shape) * max(dtype.itemsize, _SMALLEST)
         if math.prod(shape) * dtype.itemsize > there or claimed > largest:
             raise ValueError(f'the array {name} claims {claimed} bytes, but has {there}')

@@ -1,4 +1,4 @@
-"""Files from outside, up to an agreed size, with errors of one line."""
+"""Reads untrusted files up to a maximum size, with errors of one line."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from typing import BinaryIO
 
 @contextmanager
 def open_regular(path: str | Path) -> Iterator[BinaryIO]:
-    """Opens a file for reading, and never waits for who writes into it.
+    """Opens a regular file for reading, and never blocks on a pipe.
 
     Raises:
-        OSError: it can not be opened, or is a folder, a pipe or a device, which may have no end.
+        OSError: it can not be opened, or is a folder, a pipe or a device, which may be endless.
     """
     with open(path, 'rb', opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -25,13 +25,13 @@ def open_regular(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def read_bytes(path: str | Path, largest: int) -> bytes:
-    """The content of a regular file.
+    """Reads the content of a regular file.
 
     Args:
-        largest: bytes that it may have.
+        largest: maximum size, bytes.
 
     Raises:
-        ValueError: a file that can not be read, or that is larger; one line, without the path.
+        ValueError: the file can not be read or is too large; one line, without the path.
     """
     try:
         with open_regular(path) as file:

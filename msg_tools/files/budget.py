@@ -1,28 +1,28 @@
-"""What reading one file from outside may cost.
+"""A limit on memory and time for reading one untrusted file.
 
-A reader makes a `Budget` of the size of its file, and spends it before it spends memory or time.
-What a file may unpack to grows with its size: a long recording is read, and a small file can not
-claim what it does not have.
+A reader makes a `Budget` from the size of its file, and charges each step to it in advance. The
+limits grow with the size of the file: a long recording can be read, but a small file can not claim
+to have much content.
 """
 
 from __future__ import annotations
 
-# Bytes that any file may unpack to, and more for each of its own bytes. Images of one colour are
-# compressed a thousandfold; those of a camera, and messages, rarely tenfold.
+# Unpacked size that every file may have, and more per byte of the file, bytes. Images of one colour
+# are compressed a thousandfold, camera images and messages rarely tenfold.
 FREE_BYTES, BYTES_PER_BYTE = 2**26, 100
-# Records, rows or nodes that any file may have, and how many of its bytes each more of them needs.
+# Number of records, rows or nodes that every file may have, and bytes of the file for one more.
 FREE_RECORDS, BYTES_PER_RECORD = 100_000, 4
 
 
 class BudgetError(ValueError):
-    """More than a file may take, in one line; the file need not be damaged."""
+    """A file exceeds its budget, but need not be damaged; the message is one line."""
 
 
 class Budget:
-    """Bytes and records that are left to the reader of one file.
+    """Bytes and records that the reader of one file may still use.
 
     Args:
-        size: of the file, bytes.
+        size: size of the file, bytes.
     """
 
     def __init__(self, size: int) -> None:
@@ -31,14 +31,14 @@ class Budget:
         self._limits = self._bytes, self._records
 
     def spend(self, *, unpacked: int = 0, records: int = 0) -> None:
-        """Takes what the next step needs.
+        """Charges the next step to the budget.
 
         Args:
-            unpacked: bytes that compressed or repeated content becomes.
-            records: messages, rows or nodes that are made.
+            unpacked: size of compressed or repeated content once unpacked, bytes.
+            records: number of messages, rows or nodes.
 
         Raises:
-            BudgetError: that much is not left.
+            BudgetError: the step exceeds the rest of the budget.
         """
         self._bytes -= unpacked
         self._records -= records

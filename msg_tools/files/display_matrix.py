@@ -1,6 +1,6 @@
-"""How a video is shown: the display matrix in an MP4 or QuickTime file [ISO 14496-12, 8.3.2].
+"""The display matrix of a video in an MP4 or QuickTime file [ISO 14496-12, 8.3.2].
 
-OpenCV tells an angle only, which is wrong where the matrix mirrors.
+OpenCV gives only an angle, which is wrong if the matrix mirrors.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 
 from msg_tools.files.mp4_boxes import boxes_at, mapped
 
-# Images as stored; after a turn to the right by 90 degrees; by 180; by 270.
+# Matrices of the identity, and of clockwise rotations by angle, degrees.
 STORED = 1, 0, 0, 1
 TURNED = {0: STORED, 90: (0, 1, -1, 0), 180: (-1, 0, 0, -1), 270: (0, -1, 1, 0)}
 
 Matrix = tuple[int, int, int, int]
 
-_MATRIX_AT = 40, 52  # bytes, in versions 0 and 1 of the box
+_MATRIX_AT = 40, 52  # offset in versions 0 and 1 of the box, bytes
 
 
 def display_matrix(path: Path) -> Matrix | None:
-    """The matrix (a, b, c, d) of the first track of images; None: not such a file, or damaged.
+    """The matrix (a, b, c, d) of the first video track; None if missing or invalid.
 
     The stored pixel (u, v) is shown at (a u + c v, b u + d v), up to a shift and a scale.
     """

@@ -1,12 +1,12 @@
-"""Texts, parts of which may come from outside, as one short line for logs, messages and terminals.
+"""Converts untrusted text to one short line for logs, messages and terminals.
 
-Characters that a terminal obeys, or that change how others are shown, become escapes: control
-characters, those that turn the direction of text, that have no width, or that stand for no text.
+Characters that control a terminal or change the display of others are escaped: control characters,
+those that change the direction of text, that have no width, or that represent no text.
 """
 
 from __future__ import annotations
 
-# Characters of a line; one that a log puts its own words around is shorter.
+# Maximum length of a line, and of a text that a log extends, characters.
 LONGEST_LINE, LONGEST_TEXT = 300, 250
 
 
@@ -16,17 +16,17 @@ def one_line(text: str, most: int = LONGEST_TEXT) -> str:
 
 
 def error_line(error: BaseException, most: int = LONGEST_TEXT) -> str:
-    """The text of an error as one line; its type where it has none."""
+    """The text of an error as one line; the name of its type if the text is empty."""
     return one_line(str(error), most) or type(error).__name__
 
 
 def printable(text: str, most: int = LONGEST_LINE) -> str:
-    """A line as it is but for its length, with escapes for what can not be printed."""
+    """A line with escapes for unprintable characters, shortened if needed."""
     shown = (x if x.isprintable() else ascii(x)[1:-1] for x in _shortened(text, most))
     return _shortened(''.join(shown), most)
 
 
 def _shortened(text: str, most: int) -> str:
-    """A text without its middle: the place stands at the start, the remedy at the end."""
+    """Cuts out the middle of a long text; the place is at its start, the remedy at its end."""
     end = most // 3
     return text if len(text) <= most else f'{text[: most - end - 5]} ... {text[-end:]}'

@@ -1,4 +1,4 @@
-"""The boxes of which MP4 and QuickTime files are made [ISO 14496-12, 4.2]."""
+"""Reads the boxes of MP4 and QuickTime files [ISO 14496-12, 4.2]."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from msg_tools.files.bounded_file import open_regular
 
 Data: TypeAlias = 'bytes | mmap.mmap'
 
-_MOST = 300_000  # boxes in a box; videos of hours have two for each image at most
+_MOST = 300_000  # maximum number of boxes in a box; videos of hours have up to two per image
 
 
 @contextmanager
 def mapped(path: Path) -> Iterator[Data]:
-    """The content of a file.
+    """Maps the content of a file into memory.
 
     Raises:
-        OSError: it can not be read, or is no regular file.
+        OSError: the file can not be read, or is no regular file.
     """
     with open_regular(path) as file:
         if not os.fstat(file.fileno()).st_size:
@@ -33,9 +33,9 @@ def mapped(path: Path) -> Iterator[Data]:
 
 
 def boxes(data: Data, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
-    """Kinds of the boxes in a part of a file, and where their contents begin and end.
+    """Yields kind, and start and end of the content, of the boxes in a part of a file.
 
-    Boxes that are damaged, and all behind them, are left out.
+    A damaged box and all later boxes are left out.
     """
     for _ in range(_MOST):
         if start + 8 > end:
@@ -53,7 +53,7 @@ def boxes(data: Data, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
 
 
 def boxes_at(data: Data, start: int, end: int, *kinds: bytes) -> Iterator[tuple[int, int]]:
-    """Where the contents of boxes begin and end that lie at a path of kinds."""
+    """Yields start and end of the content of the boxes at a path of kinds."""
     for kind, first, last in boxes(data, start, end):
         if kind == kinds[0] and kinds[1:]:
             yield from boxes_at(data, first, last, *kinds[1:])

@@ -1,8 +1,8 @@
-"""Writes folders and files as a whole or not at all.
+"""Writes folders and files completely or not at all.
 
-Both are made in a hidden folder beside their place, `.<name>.<random>.partial`, and renamed. It is
-locked meanwhile: one without a lock is left from a process that was killed, and is removed when the
-next one has come to the same place. Links are neither replaced nor followed.
+Both are made in a hidden folder beside their place, `.<name>.<random>.partial`, and then renamed.
+The hidden folder is locked while in use. One without a lock is from a killed process, and is
+removed after the next write to the same place. Links are neither replaced nor followed.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _REPLACED, _PARTIAL = 'replaced', '.partial'
 
 @dataclass(frozen=True)
 class FolderKind:
-    """Folders of files with known names; others are never replaced.
+    """A kind of folder with known file names; other folders are never replaced.
 
     Attributes:
-        what: name of such a folder in messages: 'a bag'.
-        marker: name of the file without which it is no such folder.
+        what: name of such a folder in messages, for example 'a bag'.
+        marker: name of the file that every such folder has.
         own: patterns of the names of the other files that it may have.
     """
 
@@ -40,10 +40,10 @@ class FolderKind:
     own: tuple[str, ...]
 
     def check_place(self, target: Path, *, overwrite: bool) -> None:
-        """Raises ValueError where a folder can not come to its place.
+        """Raises ValueError if a folder can not be written to its place.
 
         Args:
-            overwrite: whether a folder of this kind that is there may be replaced.
+            overwrite: whether an existing folder of this kind may be replaced.
         """
         if not os.path.lexists(target):
             return
@@ -57,13 +57,13 @@ class FolderKind:
 
     @contextmanager
     def new(self, target: Path, *, overwrite: bool) -> Iterator[Path]:
-        """Where to make a folder, which comes to its place when all is written, or not at all.
+        """Yields the path at which to make a folder, which is moved to its place at the end.
 
-        The yielded folder does not exist yet; after an error nothing is left behind.
+        The yielded path does not exist yet. After an error all files are removed.
 
         Raises:
             ValueError: see `check_place`.
-            OSError: it can not be written.
+            OSError: the folder can not be written.
         """
         target = target.absolute()
         self.check_place(target, overwrite=overwrite)
@@ -80,10 +80,10 @@ class FolderKind:
 
 
 def check_file_place(target: Path, *, overwrite: bool) -> None:
-    """Raises ValueError where a file can not come to its place.
+    """Raises ValueError if a file can not be written to its place.
 
     Args:
-        overwrite: whether a file that is there may be replaced; a link never is.
+        overwrite: whether an existing file may be replaced; links are never replaced.
     """
     if os.path.lexists(target) and not overwrite:
         raise ValueError(f'{target} exists; give another name, or --overwrite')
@@ -95,11 +95,11 @@ def check_file_place(target: Path, *, overwrite: bool) -> None:
 
 @contextmanager
 def new_file(target: Path) -> Iterator[BinaryIO]:
-    """A file to write, which comes to its place when all is written, or not at all.
+    """Yields an open file, which is moved to its place at the end, or removed on an error.
 
     Raises:
-        ValueError: see `check_file_place`; a file that is there is replaced.
-        OSError: it can not be written.
+        ValueError: see `check_file_place`; an existing file is replaced.
+        OSError: the file can not be written.
     """
     target = target.absolute()
     check_file_place(target, overwrite=True)
@@ -111,7 +111,7 @@ def new_file(target: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def _made_aside(target: Path, own: Sequence[str]) -> Iterator[Path]:
-    """Where to make a file or a folder, which takes the place of what is there then.
+    """Yields the path at which to make a file or folder, which replaces the target at the end.
 
     Args:
         own: patterns of the names of the files that it may have.
@@ -136,10 +136,10 @@ def _made_aside(target: Path, own: Sequence[str]) -> Iterator[Path]:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[bool | None]:
-    """Shows other processes that a folder is in use.
+    """Locks a folder, so that other processes see that it is in use.
 
     Yields:
-        Whether it was free; None where the file system has no locks, of a network for example.
+        Whether it was free; None if the file system has no locks, as some network file systems.
     """
     descriptor = os.open(folder, os.O_DIRECTORY)
     try:
@@ -154,7 +154,7 @@ def locked(folder: Path) -> Iterator[bool | None]:
 
 
 def _remove_remains(target: Path, own: Sequence[str]) -> None:
-    """Removes what killed processes have left beside a place, and names it."""
+    """Removes and logs hidden folders that killed processes have left beside a place."""
     hidden = re.compile(rf'\.{re.escape(target.name)}\.[a-z0-9_]{{8}}{re.escape(_PARTIAL)}')
     with suppress(OSError):
         for path in sorted(target.parent.iterdir()):
@@ -166,7 +166,7 @@ def _remove_remains(target: Path, own: Sequence[str]) -> None:
 
 
 def _holds_only(folder: Path, name: str, own: Sequence[str]) -> bool:
-    """Whether all in a hidden folder is of what was made in it."""
+    """Whether a hidden folder contains only files that a write to its place makes."""
     return all(
         not _foreign(files, own)
         and not _foreign(folders, (glob.escape(name), _REPLACED, f'*{_PARTIAL}'))
@@ -175,5 +175,5 @@ def _holds_only(folder: Path, name: str, own: Sequence[str]) -> bool:
 
 
 def _foreign(names: Iterable[str], own: Sequence[str]) -> list[str]:
-    """Names that fit none of the patterns."""
+    """Names that match none of the patterns."""
     return [x for x in names if not any(fnmatchcase(x, pattern) for pattern in own)]

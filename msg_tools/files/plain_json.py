@@ -1,4 +1,4 @@
-"""Reads JSON from outside: the memory that its values will take is estimated first."""
+"""Reads untrusted JSON after an estimate of the memory of its values."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from typing import Any
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.error_line import error_line
 
-LARGEST = 700_000_000  # bytes that the text and its values may take
-# What Python takes for the list, the dictionary, the number or the text that a character begins.
+LARGEST = 700_000_000  # maximum memory of the text and its values, bytes
+# Memory of the Python list, dictionary, number or string that starts with a character, bytes.
 _TAKES = {b'[': 104, b'{': 210, b',': 24, b'"': 32}
 
 
 def read_plain_json(path: str | Path, largest: int) -> Any:
-    """The value in a file.
+    """Reads the value in a file.
 
     Args:
-        largest: bytes that it may have.
+        largest: maximum size of the file, bytes.
 
     Raises:
-        ValueError: a file that can not be read or is larger, or see `load_plain_json`.
+        ValueError: the file can not be read or is too large; or see `load_plain_json`.
     """
     return load_plain_json(read_bytes(path, largest))
 
 
 def load_plain_json(content: bytes | str) -> Any:
-    """The value that a text holds.
+    """Parses the value in a text.
 
     Raises:
-        ValueError: not JSON, nested too deep, or of more values than memory may hold; one line.
+        ValueError: not JSON, nested too deep, or the values need too much memory; one line.
     """
     text = content.encode('utf-8', 'surrogatepass') if isinstance(content, str) else content
     needed = len(text) * (2 if text.isascii() else 5)

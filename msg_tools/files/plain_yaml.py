@@ -1,7 +1,7 @@
-"""Reads YAML that people write by hand: plain data without aliases, of limited depth and size.
+"""Reads handwritten YAML: plain data without aliases, of limited depth and size.
 
-The loader knows no tags of Python. Aliases could expand a short file to more data than memory
-holds; ROS does not accept them in its parameter files either.
+The loader knows no Python tags. Aliases could expand a short file to more data than fits into
+memory; ROS does not accept them in its parameter files either.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import yaml
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.error_line import error_line
 
-# A parser of pure Python takes 50 us for a node.
+# Maximum number of nodes; a parser in pure Python takes 50 us per node.
 MOST_NODES = 20_000
 _DEEPEST = 50
-_LONGEST_NUMBER = 100  # characters; the time that numbers of base 60 take is quadratic
-# What constructors raise for `!!bool x`, `!!int ""`, or `!!timestamp x`.
+_LONGEST_NUMBER = 100  # characters; numbers of base 60 take quadratic time
+# Exceptions of constructors for `!!bool x`, `!!int ""`, or `!!timestamp x`.
 _FAULTS = yaml.YAMLError, ValueError, ArithmeticError, RecursionError, LookupError, AttributeError
 
 
@@ -48,13 +48,13 @@ class _PlainLoader(yaml.SafeLoader):
 
 
 def read_plain_yaml(path: str | Path, largest: int) -> Any:
-    """The document in a file.
+    """Reads the document in a file.
 
     Args:
-        largest: bytes that it may have.
+        largest: maximum size of the file, bytes.
 
     Raises:
-        ValueError: a file that can not be read or is larger, or not plain YAML; one line, without
+        ValueError: the file can not be read, is too large, or is not plain YAML; one line, without
             the path.
     """
     content = read_bytes(path, largest)
@@ -65,7 +65,7 @@ def read_plain_yaml(path: str | Path, largest: int) -> Any:
 
 
 def load_plain_yaml(text: str) -> Any:
-    """The document that a text holds.
+    """Parses the document in a text.
 
     Raises:
         ValueError: not YAML, or YAML that is not plain; one line.

@@ -1,6 +1,7 @@
-"""Opens videos from outside: containers that hold their images themselves, of a bounded size.
+"""Opens untrusted videos: only containers that contain their images, up to a maximum size.
 
-FFmpeg follows lists of other files and of addresses, and series of images by a pattern in a name.
+FFmpeg also reads lists of other files and addresses, and series of images by a name pattern; these
+are refused.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ import cv2
 
 from msg_tools.files.mp4_boxes import boxes_at, mapped
 
-MOST_PIXELS = 2**26  # of an image
+MOST_PIXELS = 2**26  # maximum size of an image, pixels
 # MP4 and QuickTime, AVI, Matroska and WebM, Ogg, Flash, GIF, ASF, MPEG and H.264, YUV4MPEG2, IVF,
-# MPEG transport streams, JPEG images one after the other, DV, MXF.
+# MPEG transport streams, sequences of JPEG images, DV, MXF.
 _CONTAINERS = re.compile(
     rb'.{4}(ftyp|moov|mdat|free|skip|wide|pnot|uuid)|RIFF.{4}AVI |\x1aE\xdf\xa3|OggS|FLV|GIF8'
     rb'|0&\xb2u|\x00?\x00\x00\x01|YUV4MPEG2|DKIF|G.{187}G|.{4}G.{191}G|\xff\xd8\xff|\x1f\x07\x00'
@@ -26,20 +27,20 @@ _CONTAINERS = re.compile(
 
 
 def open_video(path: Path) -> cv2.VideoCapture:
-    """A video whose images are in the file itself.
+    """Opens a video whose images are in the file itself.
 
     Raises:
-        OSError: it can not be read.
-        ValueError: of no such container, damaged, or of images that are too large; one line.
+        OSError: the file can not be read.
+        ValueError: another format, a damaged file, or images that are too large; one line.
     """
     with mapped(path) as data:
-        # Tables of images of one size, and those of fragments, have no bytes for each.
+        # Tables of images of one size, and those of fragments, can claim images without bytes.
         tables = boxes_at(data, 0, len(data), b'moov', b'trak', b'mdia', b'minf', b'stbl', b'stsz')
         runs = boxes_at(data, 0, len(data), b'moof', b'traf', b'trun')
         counts = chain(((at + 8, end) for at, end in tables), ((at + 4, end) for at, end in runs))
         images = sum(struct.unpack_from('>I', data, at)[0] for at, end in counts if at + 4 <= end)
         known = _CONTAINERS.match(data) and '%' not in path.name and images <= len(data)
-    # Not relative: a name with a colon would be that of a protocol.
+    # An absolute path, because a relative name with a colon would be taken for a protocol.
     capture = cv2.VideoCapture(str(path.absolute())) if known else cv2.VideoCapture()
     if not capture.isOpened():
         raise ValueError(
@@ -51,7 +52,7 @@ def open_video(path: Path) -> cv2.VideoCapture:
 
 
 def check_size(capture: cv2.VideoCapture, path: Path) -> None:
-    """Raises ValueError where the present image of a video is too large."""
+    """Raises ValueError if the current image of a video is too large."""
     width, height = (capture.get(x) for x in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
     if width * height > MOST_PIXELS:
         raise ValueError(

@@ -1,1 +1,1 @@
-"""Numpy arrays to ROS messages and back, markers and URDF for viewers."""
+"""Converts numpy arrays to ROS messages and back, and makes markers and URDF for viewers."""

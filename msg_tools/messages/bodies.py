@@ -1,4 +1,4 @@
-"""hmt_msgs/Body, and the body that the poses in a message belong to."""
+"""hmt_msgs/Body, and the body of the poses in a message."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from msg_tools.messages.urdf import body_urdf
 
 
 def message_of_body(messages: MessageFactory, body: Body, stamp_ns: int, frame_id: str) -> Any:
-    """hmt_msgs/Body of a body at its present lengths.
+    """hmt_msgs/Body of a body with its current segment lengths.
 
     Args:
-        stamp_ns: of the image that fixed the body.
+        stamp_ns: stamp of the image that determined the body.
         frame_id: optical frame of the camera; the root link of the URDF in the message.
     """
     return messages.create(
@@ -38,10 +38,10 @@ def message_of_body(messages: MessageFactory, body: Body, stamp_ns: int, frame_i
 
 
 def resized(model: Body, segment_lengths: Mapping[str, float]) -> Body:
-    """A body model at the segment lengths of a message, m; empty: at its own lengths.
+    """A body model with the segment lengths of a message, m; empty keeps its own lengths.
 
     Raises:
-        MessageError: a length that the model does not have, or that is not finite.
+        MessageError: a length of an unknown segment, or one that is not finite.
     """
     try:
         return model.with_segment_lengths(segment_lengths)
@@ -52,13 +52,12 @@ def resized(model: Body, segment_lengths: Mapping[str, float]) -> Body:
 def body_of(
     content: PoseMixture | TrajectoryMixture, model: Body, *, any_name: bool = False
 ) -> Body:
-    """The person that a mixture is about: a body model at the lengths that the message carries.
+    """The body of a mixture: the body model with the segment lengths in the message.
 
-    A message without lengths, of another publisher, is taken to be about the model at its own
-    lengths.
+    Messages of other publishers may have no lengths; the model then keeps its own lengths.
 
     Args:
-        any_name: whether the message may call the model by another name.
+        any_name: whether the message may have another name for the model.
 
     Raises:
         MessageError: a mixture of another model, or of other degrees of freedom.
@@ -73,7 +72,7 @@ def body_of(
 def description_message(
     messages: MessageFactory, body: Body, frame_id: str, link_prefix: str = ''
 ) -> Any:
-    """std_msgs/String with the URDF of a body, as viewers want it.
+    """std_msgs/String with the URDF of a body, for viewers.
 
     Its links are the frames of the transforms: the root is `frame_id`, all others have the prefix.
     """

@@ -1,7 +1,7 @@
-"""sensor_msgs/CameraInfo to a camera and back.
+"""Converts sensor_msgs/CameraInfo to a camera and back.
 
-The calibration in the message is that of the full sensor. The picture may be a part of it (roi),
-and that part may be binned: a pixel u of the sensor lies at (u - roi.x_offset) / binning_x in the
+The calibration in the message is for the full sensor. The picture may show a part of it (roi), and
+that part may be binned: a pixel u of the sensor is at (u - roi.x_offset) / binning_x in the
 picture, the convention of image_geometry.
 """
 
@@ -18,9 +18,9 @@ from hmt_ros.body.camera import unfolded_share
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_types import MessageFactory
 
-# Number of coefficients that stand for no distortion.
+# Number of zero coefficients that represent no distortion.
 _COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
-# Other names of the models. Of a pinhole the number of coefficients tells it, as in OpenCV.
+# Other names of the models. The number of coefficients gives the model of a pinhole, as in OpenCV.
 _PINHOLE = ('pinhole', 'perspective', 'none')
 _ALIASES = {
     'radtan': 'plumb_bob',
@@ -31,17 +31,17 @@ _ALIASES = {
     'kannala_brandt': 'equidistant',
     'kannala_brandt4': 'equidistant',
 }
-# Skew that is dropped, in focal lengths; it shifts the border of an image by 2 px at most, about.
+# Maximum skew that is ignored, in focal lengths; it shifts the border by about 2 px at most.
 _LARGEST_SKEW = 0.01
 
-# A calibration beyond these is damage: focal lengths and the principal point in sizes of the
-# picture, and coefficients of the distortion.
+# Limits of a valid calibration: ratio of focal lengths and principal point to the size of the
+# picture, and size of distortion coefficients.
 _FARTHEST = 1000.0
 _LARGEST_COEFFICIENT = 1e6
 
 
 class CameraInfoError(ValueError):
-    """A camera info that gives no camera, in one line: what was seen and what was wanted."""
+    """A camera info is invalid; one line with the value seen and the value wanted."""
 
 
 class UncalibratedError(CameraInfoError):
@@ -57,12 +57,12 @@ def camera_from_info(
 
     Args:
         message: sensor_msgs/CameraInfo, of `rosbags` or of ROS.
-        image_size: (width, height) of a picture that it has to fit, px; one of the same shape is
-            scaled.
-        tell: takes a line on what is neglected.
+        image_size: (width, height) of the pictures, px; a calibration for another size with the
+            same aspect ratio is scaled.
+        tell: called with a line on each approximation.
 
     Raises:
-        CameraInfoError: not calibrated, values that are not finite or do not fit each other, an
+        CameraInfoError: not calibrated, values that are not finite or contradict each other, or an
             unknown distortion model.
     """
     k = [float(value) for value in message.k]
@@ -121,7 +121,7 @@ def camera_from_info(
 
 
 def _check_plausible(k: list[float], coefficients: tuple[float, ...], size: int) -> None:
-    """Raises CameraInfoError for numbers that no camera has, and that overflow when squared."""
+    """Raises CameraInfoError for implausible numbers, which could overflow when squared."""
     low, high = size / _FARTHEST, size * _FARTHEST
     if not (low < k[0] < high and low < k[4] < high):
         raise CameraInfoError(
@@ -149,7 +149,7 @@ def _distortion(model: str, coefficients: list[float]) -> tuple[str, tuple[float
         if model not in ('', 'plumb_bob', 'rational_polynomial', 'equidistant'):
             raise CameraInfoError(f'camera info: unknown distortion model {model!r}')
         if model == 'equidistant':
-            # Without coefficients it is a perfect fisheye, not a pinhole.
+            # Without coefficients this model is an ideal fisheye, not a pinhole.
             raise CameraInfoError('camera info: equidistant without coefficients is not supported')
         return 'plumb_bob', ()
     if model == '':
@@ -157,13 +157,13 @@ def _distortion(model: str, coefficients: list[float]) -> tuple[str, tuple[float
             f'camera info: D has {len(coefficients)} coefficients, but no distortion model'
         )
     if model == 'rational_polynomial' and not any(coefficients[8:]):
-        # Thin prism and tilt, which OpenCV appends.
+        # OpenCV appends coefficients of thin prism and tilt.
         coefficients = coefficients[:8]
     return model, tuple(coefficients)
 
 
 def _region(message: Any) -> tuple[int, int, int, int]:
-    """Offset and size of the part of the sensor that the picture shows, px."""
+    """Offset and size of the part of the sensor in the picture, px."""
     width, height = int(message.width), int(message.height)
     if width < 1 or height < 1:
         raise CameraInfoError(f'camera info: size is {width}x{height}, wanted that of the picture')

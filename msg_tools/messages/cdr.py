@@ -1,11 +1,11 @@
-"""Messages to CDR bytes and back, without ROS.
+"""Converts messages to CDR bytes and back, without ROS.
 
-CDR leaves the bytes that pad a field to its alignment undefined, and the middleware of ROS 2 fills
-them with whatever its buffer held before; `rclpy.serialization.serialize_message` even appends some
-where a sequence is empty. `serialise` writes zeros into the padding and nothing behind the message:
-equal messages have equal bytes. A node that publishes these bytes (`Publisher.publish` takes them)
-puts the same bytes on the wire, and so into a recorded bag, as an offline run writes; only at the
-end the middleware may append some, up to a multiple of four, which `canonical` takes away again.
+CDR leaves the bytes that pad a field to its alignment undefined, and in the ROS 2 middleware they
+have old content of its buffer; `rclpy.serialization.serialize_message` even appends bytes after an
+empty sequence. `serialise` writes zeros into the padding and nothing after the message, so that
+equal messages have equal bytes. A node that publishes these bytes (`Publisher.publish` accepts
+them) sends and records the same bytes as an offline run writes. The middleware may only append
+bytes at the end, up to a multiple of four, which `canonical` removes.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from msg_tools.messages.definitions import Extent, extent_of
 from msg_tools.messages.message_types import typestore
 
 _HEADER_BYTES = 4
-# Values that a message may have, at most 100 bytes and 1 us each, and those that one record of the
-# budget pays for.
+# Maximum number of values of a message (up to 100 bytes and 1 us each), and number of values that
+# count as one record of the budget.
 MAX_VALUES, _VALUES_PER_RECORD = 4_000_000, 16
 
 
 def serialise(message: Any) -> bytes:
-    """Little-endian CDR bytes, with their encapsulation header, by the types of `typestore()`."""
+    """Little-endian CDR bytes with encapsulation header, for a message of `typestore()`."""
     return bytes(typestore().serialize_cdr(message, message.__msgtype__, little_endian=True))
 
 
@@ -37,20 +37,20 @@ def deserialise(
     types: Typestore | None = None,
     budget: Budget | None = None,
 ) -> Any:
-    """Message of CDR bytes; its arrays are read-only views of `data`.
+    """Reads a message from CDR bytes; its arrays are read-only views of `data`.
 
-    Bytes behind the message are ignored, as ROS does: recorders that use `serialize_message` leave
+    Bytes after the message are ignored, as in ROS: recorders that use `serialize_message` append
     some.
 
     Args:
-        data: with encapsulation header, of either byte order.
-        msgtype: for example 'hmt_msgs/msg/Body'.
-        types: where the type is looked up; None: `typestore()`.
-        budget: of the file that the bytes are of; each byte from outside may claim to be a message
-            of its own, for which an object is made.
+        data: CDR bytes with encapsulation header, in either byte order.
+        msgtype: type, for example 'hmt_msgs/msg/Body'.
+        types: types that contain it; None: `typestore()`.
+        budget: budget of the file of the bytes, because each untrusted byte may claim to be a
+            message, for which an object is made.
 
     Raises:
-        Exception: of many kinds, where the bytes are not a message of this type.
+        Exception: the bytes are not a message of this type; any class of exception is possible.
     """
     store = typestore() if types is None else types
     view = memoryview(data).toreadonly()
@@ -67,7 +67,7 @@ def deserialise(
         budget.spend(records=values // _VALUES_PER_RECORD)
     message, end = read(body, 0, definition.cls, store)
     if end > len(body):
-        # rosbags before 0.11 takes the bytes that are there for the whole of a string.
+        # rosbags before 0.11 does not detect a string that is cut off.
         raise ValueError(f'it breaks off after {len(view)} bytes')
     return message
 
@@ -78,5 +78,5 @@ def _extent_of_type(types: Typestore, msgtype: str) -> Extent:
 
 
 def canonical(data: bytes | memoryview, msgtype: str) -> bytes:
-    """The same message as CDR bytes whose padding is zero, as `serialise` writes them."""
+    """The same message as CDR bytes with zero padding, as `serialise` writes them."""
     return serialise(deserialise(data, msgtype))

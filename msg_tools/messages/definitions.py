@@ -1,8 +1,8 @@
-"""Reads message definitions from outside, in the language .msg of ROS 2.
+"""Reads untrusted message definitions in the .msg language of ROS 2.
 
-Only what CDR needs is read: names and types of fields. Constants, defaults and comments are passed
-over. The time is linear in the length of the text, and what is too large is refused before code is
-generated from it.
+Only names and types of fields are read, which CDR needs; constants, defaults and comments are
+skipped. The time is linear in the length of the text. Definitions that are too large are refused
+before code is generated from them.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 from rosbags.interfaces import Nodetype
 from rosbags.serde.utils import SIZEMAP
 
-# A definition may have so many characters, fields, levels of nesting, bytes in fixed arrays of
-# numbers, and strings or messages in fixed arrays, for each of which code is generated.
+# Limits of a definition: number of characters, fields, levels of nesting, bytes in fixed arrays,
+# and strings or messages in fixed arrays (code is generated for each).
 MAX_BYTES, MAX_FIELDS, MAX_LEVELS, MAX_SIZE, MAX_UNROLLED = 2**16, 1000, 20, 800_000, 250
 
-# Types by name: name and description of each field, as `rosbags` has them.
+# Types by name: name and description of each field, as in `rosbags`.
 Types = dict[str, list[tuple[str, Any]]]
 
 _NAME = r'[A-Za-z][A-Za-z0-9_]*'
@@ -27,7 +27,7 @@ _MSG_FIELD = re.compile(
     rf'((?:{_NAME}/){{0,2}}{_NAME})(?:<=([0-9]{{1,18}}))?(?:\[(<=)?([0-9]{{0,18}})\])?[ \t]+'
     rf'({_NAME})[ \t]*(=?)'
 )
-# The field that ROS 2 gives a message without fields.
+# The field that ROS 2 adds to a message without fields.
 _NO_FIELDS = 'structure_needs_at_least_one_member', (Nodetype.BASE, ('uint8', 0))
 _ALIASES = {
     'time': 'builtin_interfaces/msg/Time',
@@ -37,13 +37,13 @@ _ALIASES = {
 
 
 def types_of_definition(text: str, msgtype: str) -> Types:
-    """Types of a definition, with those of the nested types that stand behind it.
+    """The types of a definition, including those of the nested types after it.
 
     Args:
-        msgtype: with its package.
+        msgtype: type with its package.
 
     Raises:
-        ValueError: the text is too long, or can not be understood; one line.
+        ValueError: the text is too long or invalid; one line.
     """
     if len(text) > MAX_BYTES:
         raise ValueError(f'its definition has more than {MAX_BYTES} characters')
@@ -64,10 +64,10 @@ def types_of_definition(text: str, msgtype: str) -> Types:
 
 
 def check_types(types: Types, known: Mapping[str, Any]) -> None:
-    """Raises ValueError where types are too large, or can not be used; one line.
+    """Raises ValueError of one line if types are too large or can not be used.
 
     Args:
-        known: types that they may use, by name; the fields of each come second.
+        known: types that they may use, by name; the second item of each is its fields.
     """
     fields = [kind for each in types.values() for _, kind in each]
     if len(types) + len(fields) > MAX_FIELDS:
@@ -87,13 +87,13 @@ def check_types(types: Types, known: Mapping[str, Any]) -> None:
 
 
 class Extent(NamedTuple):
-    """What a field takes at least, with all its sequences empty.
+    """Minimum extent of a field, with all its sequences empty.
 
     Attributes:
-        values: for which objects are made; an array of numbers is one.
-        size: bytes.
-        density: values for a byte, at most, in its sequences.
-        levels: of messages in messages.
+        values: number of values, for which objects are made; an array of numbers is one value.
+        size: size, bytes.
+        density: maximum number of values per byte in its sequences.
+        levels: number of levels of nested messages.
     """
 
     values: int
@@ -105,15 +105,15 @@ class Extent(NamedTuple):
 def extent_of(
     description: Any, types: Mapping[str, Any], extents: dict[str, Extent], level: int = 0
 ) -> Extent:
-    """Extent of a field, given as `rosbags` describes it.
+    """Computes the extent of a field, given in the description of `rosbags`.
 
     Args:
-        types: by name; the fields of each come second.
-        extents: of types, as far as they are known; more are added.
-        level: of messages around the field.
+        types: types by name; the second item of each is its fields.
+        extents: known extents of types, to which new ones are added.
+        level: number of messages around the field.
 
     Raises:
-        ValueError: a type that is not known, or that is nested too deeply, as in itself.
+        ValueError: an unknown type, or one that is nested too deeply, for example in itself.
     """
     kind, detail = description
     if kind == Nodetype.BASE:
@@ -140,7 +140,7 @@ def extent_of(
 
 
 def _full_name(name: str, owner: str) -> str:
-    """Name of a type in full, as `rosbags` has it, where it stands in a field of another type."""
+    """Full name of a type, as in `rosbags`, from its name in a field of another type."""
     *package, last = _ALIASES.get(name, name).split('/')
     if not package:
         return f'{owner.rpartition("/")[0]}/{last}'
@@ -154,9 +154,9 @@ def _described(
     """Description of a field of a type.
 
     Args:
-        longest: number of characters that a string may have.
-        bounded: whether the count is that of the longest sequence.
-        count: length of an array; empty: a sequence; None: a single value.
+        longest: maximum number of characters of a string.
+        bounded: whether the count is the maximum length of a sequence.
+        count: length of an array; empty for a sequence, None for a single value.
     """
     if kind == 'string' or kind in SIZEMAP:
         one: Any = Nodetype.BASE, (kind, int(longest or 0))

@@ -3,8 +3,8 @@
 - hmt_msgs/People2D: people with keypoints of any names, boxes, or both, with or without an id.
 - hri_msgs/Skeleton2D (REP 155): one person, 18 landmarks in units of the image.
 - yolo_msgs/DetectionArray (yolo_ros): people with an id, landmarks that are numbered from 1.
-- std_msgs/Float32MultiArray: rows u, v or u, v, confidence, px, of one person, or of several with
-  an outermost dimension. The label of the outermost dimension may be the stamp of the image, ns.
+- std_msgs/Float32MultiArray: rows u, v or u, v, confidence, px, of one person, or of several in an
+  additional outermost dimension. The label of the outermost dimension may be the image stamp, ns.
 - vision_msgs/Detection2DArray: people with an id and a box, and no keypoints.
 """
 
@@ -31,13 +31,13 @@ SKELETON_2D, YOLO = 'hri_msgs/msg/Skeleton2D', 'yolo_msgs/msg/DetectionArray'
 FLOATS = 'std_msgs/msg/Float32MultiArray'
 PEOPLE_2D, BOXES = 'hmt_msgs/msg/People2D', 'vision_msgs/msg/Detection2DArray'
 REGION = 'sensor_msgs/msg/RegionOfInterest'
-# Classes of vision_msgs detections that are people: names of data sets, and their numbers in COCO.
+# Classes of people in vision_msgs detections: names in data sets, and the number in COCO.
 PERSON_CLASSES = ('person', 'people', 'human', 'pedestrian', '0', '')
-# People in one image.
+# Maximum number of people in one image.
 MAX_PEOPLE = 1000
 
 
-# Keypoints of a detector that saw nobody, or that finds none.
+# Keypoints where nobody was seen, or of a detector without keypoints.
 NO_KEYPOINTS = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 
 
@@ -45,9 +45,9 @@ class DetectedPerson(NamedTuple):
     """A person in an image.
 
     Attributes:
-        name: identity that the detector gives; '' if it gives none.
-        keypoints: landmarks under the names of their scheme; none: there is only a box.
-        box: (left, top, right, bottom) px; None: unknown.
+        name: identity from the detector; '' if it gives none.
+        keypoints: landmarks under the names of their scheme; empty if there is only a box.
+        box: (left, top, right, bottom) px; None if unknown.
     """
 
     name: str
@@ -56,9 +56,9 @@ class DetectedPerson(NamedTuple):
 
     @property
     def extent(self) -> Array | None:
-        """Corners (2, 2), left top and right bottom, of the box or of the keypoints that were seen.
+        """Top left and bottom right corner (2, 2) of the box, or else of the seen keypoints.
 
-        None: nothing of the person was seen.
+        None if no part of the person was seen.
         """
         if self.box is not None:
             return np.array(self.box, dtype=np.float64).reshape(2, 2)
@@ -73,7 +73,7 @@ def person_of_skeleton(message: Any, width: int, height: int) -> DetectedPerson:
         width, height: size of the image, px.
 
     Raises:
-        MessageError: another number of landmarks, numbers that are no positions.
+        MessageError: another number of landmarks, or invalid positions.
     """
     scheme = schemes()['skeleton2d']
     wanted = len(scheme.names)
@@ -81,7 +81,7 @@ def person_of_skeleton(message: Any, width: int, height: int) -> DetectedPerson:
         raise MessageError(f'Skeleton2D has {len(message.skeleton)} points, wanted {wanted}')
     rows = np.array([(p.x, p.y, p.c) for p in message.skeleton], dtype=np.float64)
     rows[(rows[:, :2] == 0).all(1)] = np.nan, np.nan, 0.0
-    # (0, 0) is the edge of the first pixel, whose centre is the origin here.
+    # In the message (0, 0) is the corner of the first pixel; here it is its centre.
     rows[:, :2] = rows[:, :2] * (width, height) - 0.5
     return _person('', scheme, rows)
 
@@ -90,11 +90,11 @@ def people_of_message(message: Any, sigma_px: float = 0.0) -> list[DetectedPerso
     """The people in an hmt_msgs/People2D.
 
     Args:
-        sigma_px: as for `keypoints_of`.
+        sigma_px: see `keypoints_of`.
 
     Raises:
-        MessageError: numbers of keypoints or boxes that are not those of the people; keypoints that
-            `keypoints_of` refuses.
+        MessageError: the number of keypoints or boxes differs from that of the people, or
+            `keypoints_of` refuses keypoints.
     """
     n = len(message.ids)
     _check_count(n)
@@ -137,10 +137,10 @@ def people_message(
 
 
 def people_of_boxes(message: Any) -> list[DetectedPerson]:
-    """The people in a vision_msgs/Detection2DArray: detections of another class are left out.
+    """The people in a vision_msgs/Detection2DArray; detections of other classes are left out.
 
     Raises:
-        MessageError: a box that has no area, or numbers that are no positions.
+        MessageError: a box without area, or invalid positions.
     """
     _check_count(len(message.detections))
     people = []
@@ -168,11 +168,11 @@ def people_of_yolo(message: Any, scheme: Scheme) -> list[DetectedPerson]:
     """The people with keypoints in a yolo_msgs/DetectionArray.
 
     Args:
-        scheme: whose order the numbers of the keypoints follow.
+        scheme: scheme whose order numbers the keypoints.
 
     Raises:
-        MessageError: a number that the scheme does not have, or one that is there twice; numbers
-            that are no positions.
+        MessageError: a number that the scheme does not have, a number that occurs twice, or invalid
+            positions.
     """
     _check_count(len(message.detections))
     people = []
@@ -200,12 +200,12 @@ def people_of_floats(message: Any, scheme: Scheme) -> list[DetectedPerson]:
     """The people in a std_msgs/Float32MultiArray.
 
     Args:
-        message: (n, 2) or (n, 3), or (people, n, 2) or (people, n, 3); without dimensions, one
-            person. An empty array says that nobody was seen.
-        scheme: with n landmarks, in the order of the rows.
+        message: array (n, 2) or (n, 3), or (people, n, 2) or (people, n, 3); one person without
+            dimensions. An empty array means that nobody was seen.
+        scheme: scheme with n landmarks, in the order of the rows.
 
     Raises:
-        MessageError: another shape; numbers that are no positions.
+        MessageError: another shape, or invalid positions.
     """
     n = len(scheme.names)
     data = np.array(message.data, dtype=np.float64)[int(message.layout.data_offset) :]
@@ -229,7 +229,7 @@ def people_of_floats(message: Any, scheme: Scheme) -> list[DetectedPerson]:
 
 
 def stamp_of_floats(message: Any) -> int | None:
-    """The stamp of the image of a std_msgs/Float32MultiArray, ns; None where it does not say."""
+    """The image stamp in a std_msgs/Float32MultiArray, ns; None if it has none."""
     dimensions = message.layout.dim
     label = str(dimensions[0].label) if len(dimensions) else ''
     return int(label) if label.isascii() and label.isdigit() and len(label) < 20 else None

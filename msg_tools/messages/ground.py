@@ -1,4 +1,4 @@
-"""hmt_msgs/Ground: gravity, the floor, and the feet that stand on it."""
+"""hmt_msgs/Ground: gravity, the floor, and the contacts of the feet."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from msg_tools.messages.message_types import MessageFactory
 GROUND = 'hmt_msgs/msg/Ground'
 
 
-# Largest error of the length of up, and of the plane.
+# Maximum error of the length of `up`, and of the entries of the plane.
 _TOLERANCE = 1e-6
 
 
@@ -25,12 +25,12 @@ class GroundState:
     """The content of an hmt_msgs/Ground.
 
     Attributes:
-        stamp_ns, frame_id: of the image; frame: optical frame of the camera.
-        up: (3,) unit vector against gravity.
-        up_sigma: standard deviation of its direction, rad; NaN: unknown.
-        height: of the camera above the floor, m; None: unknown.
-        height_sigma: its standard deviation, m; NaN: unknown.
-        contacts: probability that a foot stands on the floor, by its name, left_foot say.
+        stamp_ns, frame_id: stamp of the image, and optical frame of the camera.
+        up: (3,) unit vector opposite to gravity.
+        up_sigma: standard deviation of its direction, rad; NaN if unknown.
+        height: height of the camera above the floor, m; None if unknown.
+        height_sigma: standard deviation of the height, m; NaN if unknown.
+        contacts: probability that a foot is on the floor, by its name, for example left_foot.
 
     Raises:
         MessageError: values that contradict each other or are out of range.
@@ -62,12 +62,12 @@ class GroundState:
 
     @property
     def plane(self) -> Array | None:
-        """The floor (4,): n, d with n.x + d = 0, n = up, d = height; None: unknown."""
+        """The floor (4,): n, d with n.x + d = 0, n = up, d = height; None if unknown."""
         return None if self.height is None else np.array([*self.up, self.height])
 
 
 def ground_message(messages: MessageFactory, content: GroundState) -> Any:
-    """hmt_msgs/Ground."""
+    """Makes an hmt_msgs/Ground."""
     x, y, z = content.up.tolist()
     plane = content.plane
     return messages.create(

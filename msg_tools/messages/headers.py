@@ -9,10 +9,10 @@ from msg_tools.messages.message_error import MessageError
 from msg_tools.messages.message_types import MessageFactory
 
 SECOND_NS = 1_000_000_000
-FRAME_ID = 'camera_optical_frame'  # of a camera whose messages name no frame
-START_NS = 1_700_000_000 * SECOND_NS  # stamp of the first image of what no clock has stamped
-EARLIEST_NS = -(2**31) * SECOND_NS  # that a message can hold
-_STAMP_AT, _STAMP_SIZE = 4, 8  # bytes of CDR
+FRAME_ID = 'camera_optical_frame'  # default frame of a camera
+START_NS = 1_700_000_000 * SECOND_NS  # default stamp of the first image
+EARLIEST_NS = -(2**31) * SECOND_NS  # earliest time of a message
+_STAMP_AT, _STAMP_SIZE = 4, 8  # offset and size of the stamp in CDR, bytes
 
 
 def time_message(messages: MessageFactory, stamp_ns: int) -> Any:
@@ -25,7 +25,7 @@ def time_ns(time: Any) -> int:
     """Time in ns of a builtin_interfaces/Time, `message.header.stamp` for example.
 
     Raises:
-        MessageError: a second or more of nanoseconds.
+        MessageError: the field nanosec is a second or more.
     """
     nanoseconds = int(time.nanosec)
     if nanoseconds >= SECOND_NS:
@@ -35,8 +35,8 @@ def time_ns(time: Any) -> int:
 
 
 def stamp_in(data: bytes) -> int:
-    """Stamp, ns, of the header that opens a message of CDR bytes; 0 if they have none."""
-    # Behind the encapsulation, whose second byte tells the order of bytes.
+    """Stamp, ns, of the header at the start of a message in CDR bytes; 0 if it has none."""
+    # After the encapsulation, whose second byte gives the byte order.
     if len(data) < _STAMP_AT + _STAMP_SIZE:
         return 0
     order = '<' if data[1] & 1 else '>'
@@ -45,7 +45,7 @@ def stamp_in(data: bytes) -> int:
 
 
 def header_message(messages: MessageFactory, stamp_ns: int, frame_id: str) -> Any:
-    """std_msgs/Header."""
+    """Makes a std_msgs/Header."""
     return messages.create(
         'std_msgs/msg/Header', stamp=time_message(messages, stamp_ns), frame_id=frame_id
     )

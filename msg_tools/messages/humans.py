@@ -1,7 +1,7 @@
-"""Messages of REP 155 about a body: its place and landmarks in the image, its reference model.
+"""Messages of REP 155 about a body: its region and landmarks in the image, its reference model.
 
-The types of hri_msgs are read from the package where it is installed (`register_definitions`).
-Coordinates in the image are in units of its width and height, from its upper left corner.
+The types of hri_msgs are read from the installed package (`register_definitions`). Image
+coordinates are in units of width and height, from the upper left corner.
 """
 
 from __future__ import annotations
@@ -28,17 +28,18 @@ IDS = 'hri_msgs/msg/IdsList'
 REGION = 'hri_msgs/msg/NormalizedRegionOfInterest2D'
 _LANDMARK = 'hri_msgs/msg/NormalizedPointOfInterest2D'
 
-# Reach of the body around a joint, m: flesh, skull, fingers.
+# Extent of the body around a joint (flesh, skull, fingers), m.
 REACH = 0.12
-# From the axes of the head's landmarks, x to the person's right, y backwards, z down, to those of
-# the reference model.
+# Rotation from the axes of the head's landmarks (x to the person's right, y backwards, z down) to
+# those of the reference model.
 _OF_HEAD = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-# Modes agree on a landmark, or on a corner of the region, within this share of the region's height.
+# Maximum distance at which modes agree on a landmark or a corner of the region, in heights of the
+# region.
 _AGREE = 0.1
 
 
 def ids_message(messages: MessageFactory, ids: Sequence[str], stamp_ns: int) -> Any:
-    """hri_msgs/IdsList of the bodies that are tracked."""
+    """hri_msgs/IdsList of the tracked bodies."""
     return messages.create(IDS, header=header_message(messages, stamp_ns, ''), ids=list(ids))
 
 
@@ -46,10 +47,10 @@ def region_in_image(camera: Camera, positions: Array) -> Array | None:
     """Left, top, right and bottom (4,) of a person in an image, px from its upper left corner.
 
     Args:
-        positions: (J, 3) of the joints in the frame of the camera, m.
+        positions: (J, 3) positions of the joints in the frame of the camera, m.
 
     Returns:
-        None where nobody of that pose is in the image.
+        The region; None if no part of the person is in the image.
     """
     pixels = camera.project(positions)
     seen = np.isfinite(pixels).all(1)
@@ -72,13 +73,13 @@ def region_message(
     stamp_ns: int,
     frame_id: str,
 ) -> Any:
-    """hri_msgs/NormalizedRegionOfInterest2D.
+    """Makes an hri_msgs/NormalizedRegionOfInterest2D.
 
     Args:
-        region: (4,) of the mode that is shown, see `region_in_image`.
+        region: (4,) region of the shown mode, see `region_in_image`.
         others: (K) regions of all modes.
-        weights: (K,) of the modes. The confidence is the probability that each corner is within a
-            tenth of the region's height.
+        weights: (K,) weights of the modes. The confidence is the probability that each side is
+            within a tenth of the height of the region from the shown one.
     """
     near = _AGREE * (region[3] - region[1])
     agree = [other is not None and np.abs(other - region).max() <= near for other in others]
@@ -100,16 +101,16 @@ def skeleton_message(
     stamp_ns: int,
     frame_id: str,
 ) -> Any:
-    """hri_msgs/Skeleton2D.
+    """Makes an hri_msgs/Skeleton2D.
 
-    Landmarks that are not known, or beyond the image, are at (0, 0) with a confidence of 0. The
-    confidence of the others is the probability that they are within a tenth of the height of all
-    landmarks of where they are shown.
+    Landmarks that are unknown or outside of the image are at (0, 0) with confidence 0. The
+    confidence of any other landmark is the probability that it is near its shown position, within a
+    tenth of the height of all landmarks.
 
     Args:
-        landmarks: (K, 18, 3) in all modes, see `landmarks_in_space`.
+        landmarks: (K, 18, 3) landmarks in all modes, see `landmarks_in_space`.
         shown: index of the mode whose landmarks are sent.
-        weights: (K,) of the modes.
+        weights: (K,) weights of the modes.
     """
     # (0, 0) is the centre of the first pixel.
     pixels = camera.project(landmarks) + 0.5
@@ -132,8 +133,8 @@ def landmarks_in_space(
 ) -> Array:
     """Landmarks (K, 18, 3) of Skeleton2D in the frame of the joint positions (K, J, 3), m.
 
-    Landmarks of limbs are their joints, nose and ears have the places that detectors give them
-    on a head turned like that of the reference model; eyes are unknown, NaN.
+    Landmarks of limbs are their joints. Nose and ears are at the positions that detectors give them
+    on a head with the rotation of the reference model. Eyes are unknown, NaN.
     """
     marks = schemes()['skeleton2d'].landmarks
     names, rotations, _ = human.links()
@@ -151,7 +152,7 @@ def cropped_message(messages: MessageFactory, image: Any, region: Array) -> Any:
     """sensor_msgs/Image with the part of an image within a region (4,), px.
 
     Raises:
-        ImageError: an image that can not be decoded.
+        ImageError: the image can not be decoded.
     """
     left, top = np.floor(region[:2]).astype(int)
     right, bottom = np.ceil(region[2:]).astype(int)
@@ -163,7 +164,7 @@ def cropped_message(messages: MessageFactory, image: Any, region: Array) -> Any:
 def human_joint_states(
     messages: MessageFactory, human: ReferenceHuman, body_id: str, stamp_ns: int
 ) -> Any:
-    """sensor_msgs/JointState of the reference model; names end in the identity of the body."""
+    """sensor_msgs/JointState of the reference model; names end with the identity of the body."""
     names = [f'{name}_{body_id}' for name in human.angles]
     return joint_state_message(
         messages, names, list(human.angles.values()), stamp_ns, f'body_{body_id}'
@@ -179,10 +180,10 @@ def human_transforms(
     *,
     links: bool,
 ) -> Any:
-    """tf2_msgs/TFMessage: the body, seen from the camera, and all links, seen from the body.
+    """tf2_msgs/TFMessage with the body relative to the camera, and the links relative to the body.
 
     Args:
-        links: whether the links are sent, or the body alone.
+        links: whether to send the links too, or only the body.
     """
     root = f'body_{body_id}'
     names, rotations, places = (
@@ -199,9 +200,9 @@ def human_transforms(
 
 
 def human_urdf(human: ReferenceHuman, body_id: str, rod_radius: float = 0.03) -> str:
-    """The reference model at the lengths of a person, as a URDF; names end in the identity.
+    """The reference model with the lengths of a person as a URDF; names end with the identity.
 
-    Ranges are those of the angles, [-pi, pi]: people leave the narrower ones of the reference.
+    All angles have the range [-pi, pi], because people exceed the narrower ranges of the reference.
     """
     robot = ET.Element('robot', name=f'human_{body_id}')
     links = {'body': ET.SubElement(robot, 'link', name=f'body_{body_id}')}

@@ -1,11 +1,11 @@
-"""Pictures of sensor_msgs/Image and sensor_msgs/CompressedImage as arrays, and back.
+"""Converts sensor_msgs/Image and sensor_msgs/CompressedImage to arrays and back.
 
 A decoded picture is always BGR, uint8, (H, W, 3), contiguous and writable. Messages of `rosbags`
-and of ROS will both do: the data may be any buffer of bytes.
+and of ROS are both accepted: the data may be any buffer of bytes.
 
 A depth image is registered to a colour image of the same size: each value is the depth of the
-surface at that pixel, along the axis of the camera (REP 118). `16UC1` counts millimetres, 0 where
-nothing was measured; `32FC1` counts metres, NaN where nothing was measured.
+surface at that pixel, along the axis of the camera (REP 118). `16UC1` is in mm, 0 without
+measurement; `32FC1` is in m, NaN without measurement.
 """
 
 from __future__ import annotations
@@ -26,42 +26,44 @@ Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 Depth = NDArray[np.float32]
 
-# Larger pictures count as damaged, before memory is spent on them.
+# Maximum number of pixels; larger pictures are refused before memory is allocated.
 MAX_PIXELS = 2**26
 
 _PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
-# Where the header of a PNG has its sizes, and how many bits a channel has; the colour type follows,
-# 0 is grey.
+# Offsets of size and bits per channel in the header of a PNG, bytes; the colour type follows, 0 is
+# grey.
 _PNG_SIZES, _PNG_DEPTH = 16, 24
-# Chunks of a PNG that its picture needs: texts, profiles and animations may unpack to anything.
+# Chunks of a PNG that are kept; texts, profiles and animations could unpack to any size.
 _PNG_CHUNKS = b'IHDR', b'PLTE', b'tRNS', b'IDAT', b'IEND'
 
-# Segments of a JPEG before that with its sizes, whose markers are in the set.
+# Start of a JPEG, and maximum number of segments before the frame header, whose markers are
+# `_JPEG_FRAMES`.
 _JPEG_START, _MAX_JPEG_SEGMENTS = b'\xff\xd8', 1000
 _JPEG_SEGMENT = re.compile(rb'\xff+([\xc0-\xcf\xdb-\xfe])(..)', re.DOTALL)
 _JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 _JPEG_SCAN, _JPEG_END = b'\xff\xda', b'\xff\xd9'
-# A progressive JPEG has a dozen; each costs the decoder a pass over the whole picture.
+# Maximum number of scans; a progressive JPEG has a dozen, each one pass over the whole picture.
 MAX_JPEG_SCANS = 100
-_MAX_SCANNED = 16 * MAX_PIXELS  # pixels of all scans
+_MAX_SCANNED = 16 * MAX_PIXELS  # maximum number of pixels of all scans
 
-# Limits of compression: JPEG spends at least one bit on each block of 8x8 pixels, deflate one byte
-# on 1032, which in PNG may be 8 pixels each.
+# Limits of compression: JPEG needs at least one bit per block of 8x8 pixels, deflate one byte per
+# 1032 bytes, each of which may be 8 pixels of a PNG.
 _JPEG_PIXELS_PER_BYTE = 512
 _PNG_PIXELS_PER_BYTE = 8 * 1032
-# Pixels that any file may have, and more for each of its bytes: a few small files of one colour
-# must not keep a reader for minutes.
+# Number of pixels that every file may have, and more per byte of the file, so that small files of
+# one colour can not occupy a reader for minutes.
 FREE_PIXELS, _PIXELS_PER_BYTE = 2**24, 16
-# Four channels of 16 bits that deflate does not compress; what follows would be inflated, too.
+# Maximum size of a PNG per pixel (four incompressible channels of 16 bits) and in addition, bytes;
+# all data would be inflated.
 _PNG_BYTES_PER_PIXEL, _PNG_BYTES = 9, 10_000
 
 
 class ImageError(ValueError):
-    """A picture that can not be decoded, in one line: what was seen and what was wanted."""
+    """A picture can not be decoded; one line with the value seen and the value wanted."""
 
 
-# Encoding: (dtype, channels, conversion to BGR or None). The names of OpenCV for Bayer patterns are
-# those of the second row, second column: its BG is rggb.
+# Encoding: (dtype, channels, conversion to BGR or None). OpenCV names Bayer patterns after the
+# second row and column: its BG is rggb.
 _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     'mono8': ('u1', 1, cv2.COLOR_GRAY2BGR),
     '8UC1': ('u1', 1, cv2.COLOR_GRAY2BGR),
@@ -97,24 +99,24 @@ _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     'nv21': ('u1', 1, cv2.COLOR_YUV2BGR_NV21),
 }
 _MASKS = ('mono8', '8UC1')
-# Chroma rows of half the height follow the picture.
+# Encodings with chroma rows of half the height after the picture.
 _PLANAR = ('nv12', 'nv21', 'yuv420', 'i420', 'yv12')
-# Their rows are half as long in these, one plane after the other.
+# Encodings with chroma rows of half the width, one plane after the other.
 _THREE_PLANES = ('yuv420', 'i420', 'yv12')
-# Two neighbours share their chroma, or a colour pattern repeats.
+# Encodings in which two neighbours share their chroma.
 _EVEN_WIDTH = ('yuv422', 'uyvy', 'yuv422_yuy2', 'yuyv', 'yvyu', *_PLANAR)
-# Encoding: dtype and how many of its units are a metre. Some drivers say mono16 for 16UC1.
+# Encoding: (dtype, units per metre). Some drivers write mono16 for 16UC1.
 _DEPTH_ENCODINGS = {'16UC1': ('u2', 1000), 'mono16': ('u2', 1000), '32FC1': ('f4', 1)}
 
 
 def decode_image(message: Any) -> Picture:
     """The picture of an Image or a CompressedImage, BGR (H, W, 3).
 
-    16-bit pictures are scaled to 8 bits, grey ones get three equal channels, alpha is dropped; an
-    orientation that a camera wrote into a JPEG is ignored, as the calibration knows nothing of it.
+    16-bit pictures are scaled to 8 bits, grey ones get three equal channels, and alpha is dropped.
+    The orientation in a JPEG is ignored, because the calibration is for the stored picture.
 
     Raises:
-        ImageError: unknown encoding, sizes that contradict each other, bytes that are no picture.
+        ImageError: unknown encoding, contradictory sizes, or bytes that are no picture.
     """
     if hasattr(message, 'encoding'):
         return _decode_raw(message)
@@ -177,11 +179,11 @@ def _rows_of(message: Any, rows: int, row_bytes: int, what: str = 'image') -> Pi
 def decode_mask(message: Any) -> Mask:
     """The mask (H, W) of an Image, `mono8` or `8UC1`, or of a CompressedImage, a grey PNG.
 
-    True where the value is not zero. A JPEG is refused: it blurs the outline of the mask, and
-    zeros do not stay zero.
+    True where the value is not zero. A JPEG is refused, because it blurs the outline of the mask
+    and changes zeros.
 
     Raises:
-        ImageError: another encoding, sizes that contradict each other, bytes that are no picture.
+        ImageError: another encoding, contradictory sizes, or bytes that are no picture.
     """
     if hasattr(message, 'encoding'):
         encoding = str(message.encoding)
@@ -207,17 +209,17 @@ def decode_mask(message: Any) -> Mask:
 def decode_picture(
     content: bytes, form: str = 'unknown format', colours: int = cv2.IMREAD_COLOR
 ) -> Picture:
-    """The picture of a PNG or JPEG file, BGR (H, W, 3) unless other colours are asked for.
+    """Decodes a PNG or JPEG file to a picture, BGR (H, W, 3) unless `colours` is given.
 
-    The size in the header of the file is checked before anything is decoded.
+    The size in the header of the file is checked before decoding.
 
     Args:
-        form: format that it claims to have, for messages.
+        form: claimed format, for error messages.
         colours: flag of OpenCV for the channels of the picture.
 
     Raises:
-        ImageError: another format, a damaged file, more pixels than `MAX_PIXELS`, more pixels than
-            so many bytes can hold, or may have.
+        ImageError: another format, a damaged file, more pixels than `MAX_PIXELS`, or more than is
+            possible or allowed for the size of the file.
     """
     if content.startswith(b'\xff\xd8\xff'):
         width, height = _jpeg_size(content)
@@ -244,7 +246,7 @@ def decode_picture(
 
 
 def decoded(content: bytes, flags: int = cv2.IMREAD_COLOR) -> Picture:
-    """The picture that OpenCV finds in a file of any format.
+    """Decodes a picture in any format of OpenCV.
 
     Raises:
         ImageError: another format, or a damaged file.
@@ -274,14 +276,14 @@ def _check_picture(image: NDArray[np.uint8]) -> None:
 
 def _bytes_of(data: Any) -> Picture:
     try:
-        # numpy takes no empty buffer.
+        # numpy rejects an empty buffer.
         return np.frombuffer(data, dtype=np.uint8) if len(data) else np.zeros(0, dtype=np.uint8)
     except (TypeError, ValueError) as error:
         raise ImageError(f'image data is a {type(data).__name__}, wanted bytes') from error
 
 
 def _plain_png(content: bytes) -> bytes:
-    """A PNG file that is whole, without the chunks that its picture does not need."""
+    """Returns a PNG file without unneeded chunks; raises ImageError if it is incomplete."""
     parts, at, kind = [_PNG_SIGNATURE], len(_PNG_SIGNATURE), b''
     while kind != b'IEND':
         size = int.from_bytes(content[at : at + 4], 'big')
@@ -297,7 +299,7 @@ def _plain_png(content: bytes) -> bytes:
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int]:
-    """Width and height of a JPEG file that is whole; a decoder would invent what is not."""
+    """Width and height of a complete JPEG file; a decoder would invent missing parts."""
     what = f'jpeg of {len(content)} bytes'
     found = _JPEG_SEGMENT.match(content, len(_JPEG_START))
     for _ in range(_MAX_JPEG_SEGMENTS):
@@ -309,7 +311,7 @@ def _jpeg_size(content: bytes) -> tuple[int, int]:
         raise ImageError(f'{what} breaks off or is damaged: its size is missing')
     height, width = struct.unpack_from('>HH', content, found.end() + 1)
     _check_size(width, height)
-    # Within a scan a byte ff is never followed by the number of a marker like these.
+    # Within a scan a byte ff is never followed by the number of one of these markers.
     scans = content.count(_JPEG_SCAN)
     most = min(MAX_JPEG_SCANS, _MAX_SCANNED // (width * height + 1))
     if scans > most:
@@ -320,7 +322,7 @@ def _jpeg_size(content: bytes) -> tuple[int, int]:
 
 
 def encode_jpeg(image: NDArray[np.uint8], quality: int = 90) -> bytes:
-    """JPEG file of a picture, BGR (H, W, 3) or grey (H, W); the same bytes for the same picture.
+    """Encodes a picture, BGR (H, W, 3) or grey (H, W), as JPEG; equal pictures give equal bytes.
 
     Raises:
         ImageError: not a picture.
@@ -363,10 +365,10 @@ def image_message(
 
 
 def decode_depth(message: Any) -> Depth:
-    """The depths (H, W) of a sensor_msgs/Image, m, float32; 0 or NaN where nothing was measured.
+    """The depths (H, W) of a sensor_msgs/Image, m, float32; 0 or NaN without measurement.
 
     Raises:
-        ImageError: another encoding, or sizes that contradict each other.
+        ImageError: another encoding, or contradictory sizes.
     """
     encoding = str(message.encoding)
     if encoding not in _DEPTH_ENCODINGS:
@@ -381,7 +383,7 @@ def decode_depth(message: Any) -> Depth:
 def depth_message(
     messages: MessageFactory, depth: NDArray[np.uint16] | Depth, stamp_ns: int, frame_id: str
 ) -> Any:
-    """sensor_msgs/Image of depths (H, W): uint16 in mm becomes 16UC1, float32 in m 32FC1.
+    """sensor_msgs/Image of depths (H, W): 16UC1 for uint16 in mm, 32FC1 for float32 in m.
 
     Raises:
         ImageError: an array of another shape or type.

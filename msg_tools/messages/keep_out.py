@@ -1,4 +1,4 @@
-"""hmt_msgs/KeepOut: capsules that hold the person, for planners, and the same for viewers."""
+"""hmt_msgs/KeepOut: capsules around the person, for planners and viewers."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ KEEP_OUT = 'hmt_msgs/msg/KeepOut'
 _ADD, _DELETE_ALL = 0, 3
 _SPHERE, _CYLINDER = 2, 3
 _COLOUR = {'r': 0.85, 'g': 0.15, 'b': 0.10, 'a': 0.25}
-# shape_msgs/SolidPrimitive.
+# Constants of shape_msgs/SolidPrimitive.
 _SOLID_SPHERE, _SOLID_CYLINDER = 2, 3
-# Axes that are shorter are points, m.
+# Length of an axis below which a capsule is a sphere, m.
 _POINT = 1e-6
 
 
@@ -48,15 +48,15 @@ class KeepOut:
     """The content of an hmt_msgs/KeepOut.
 
     Attributes:
-        stamp_ns, frame_id: time that it is about, and frame.
-        state: of the person.
+        stamp_ns, frame_id: time of the state, and frame of the capsules.
+        state: state of the person.
         starts, ends: (N, 3) ends of the axes of capsules, m.
-        radii: (N,) m.
-        track_id: number of the track; 0: none.
-        existence_probability: that a person is in view; NaN: not known.
-        unseen: time since the last image that showed the person, s; NaN: none did.
-        probability: that was asked for.
-        reason: what is missing where the state is not known; '' where nothing is.
+        radii: (N,) radii of the capsules, m.
+        track_id: number of the track; 0 for none.
+        existence_probability: probability that a person is in view; NaN if unknown.
+        unseen: time since the last image that showed the person, s; NaN if none did.
+        probability: requested probability, for each part of the person and for the modes.
+        reason: reason why the state is unknown; '' if it is known.
 
     Raises:
         MessageError: values that contradict each other or are out of range.
@@ -89,7 +89,7 @@ class KeepOut:
 
 
 def keep_out_message(messages: MessageFactory, content: KeepOut) -> Any:
-    """hmt_msgs/KeepOut."""
+    """Makes an hmt_msgs/KeepOut."""
     return messages.create(
         KEEP_OUT,
         header=header_message(messages, content.stamp_ns, content.frame_id),
@@ -132,11 +132,11 @@ def keep_out_of(message: Any) -> KeepOut:
 
 
 def collision_shapes(messages: MessageFactory, content: KeepOut) -> tuple[list[Any], list[Any]]:
-    """Capsules for planners that know none: a cylinder, and a sphere at each end of it.
+    """Converts capsules for planners without capsules: a cylinder with a sphere at each end.
 
     Returns:
-        shape_msgs/SolidPrimitive and geometry_msgs/Pose of each, as moveit_msgs/CollisionObject
-        takes them.
+        shape_msgs/SolidPrimitive and geometry_msgs/Pose of each, for a
+        moveit_msgs/CollisionObject.
     """
     solids, poses = [], []
     for kind, size, place, turn in _pieces(content):
@@ -150,7 +150,7 @@ def collision_shapes(messages: MessageFactory, content: KeepOut) -> tuple[list[A
 
 
 def keep_out_markers(messages: MessageFactory, content: KeepOut) -> Any:
-    """visualization_msgs/MarkerArray of the capsules; it removes those before."""
+    """visualization_msgs/MarkerArray of the capsules, which also deletes earlier markers."""
     header = header_message(messages, content.stamp_ns, content.frame_id)
     name = 'visualization_msgs/msg/Marker'
     markers = [messages.create(name, header=header, action=_DELETE_ALL)]
@@ -175,7 +175,7 @@ def keep_out_markers(messages: MessageFactory, content: KeepOut) -> Any:
 
 
 def _pieces(content: KeepOut) -> list[tuple[int, tuple[float, float], Array, Array]]:
-    """Kind, radius and length, place (3,), and turn from z (4,) of each sphere and cylinder."""
+    """Kind, (radius, length), centre (3,) and rotation from z (4,) of each sphere and cylinder."""
     result: list[tuple[int, tuple[float, float], Array, Array]] = []
     upright = np.array([0.0, 0.0, 0.0, 1.0])
     for start, end, radius in zip(content.starts, content.ends, content.radii, strict=True):
@@ -191,7 +191,7 @@ def _pieces(content: KeepOut) -> list[tuple[int, tuple[float, float], Array, Arr
 
 
 def _turn_to(axis: Array) -> Array:
-    """Quaternion (4,) x, y, z, w that turns z to a unit vector (3,)."""
+    """Quaternion (4,) x, y, z, w that rotates z to a unit vector (3,)."""
     x, y, z = axis.tolist()
     turn = np.array([-y, x, 0.0, 1.0 + z]) if z > -0.999999 else np.array([1.0, 0.0, 0.0, 0.0])
     return np.asarray(turn / np.linalg.norm(turn, axis=0))

@@ -1,8 +1,8 @@
 """hmt_msgs/Keypoints2D and hmt_msgs/Keypoints3D: keypoints of a person, as arrays.
 
-A keypoint is not seen if its confidence is 0, if its position is not a number, or if it lies at
-(0, 0) in the image, where detectors put missing keypoints. Its other fields then do not matter.
-A message without names says that nobody was seen; it has no keypoints.
+A keypoint is unseen if its confidence is 0, if its position is NaN, or if it is at (0, 0) in the
+image, where detectors put missing keypoints. Its other fields are then ignored. A message without
+names has no keypoints and means that nobody was seen.
 """
 
 from __future__ import annotations
@@ -24,27 +24,26 @@ from msg_tools.messages.message_error import (
 from msg_tools.messages.message_types import MessageFactory
 
 KEYPOINTS_2D, KEYPOINTS_3D = 'hmt_msgs/msg/Keypoints2D', 'hmt_msgs/msg/Keypoints3D'
-# Of one person; detectors find up to a few hundred.
+# Maximum number of keypoints of one person; detectors find up to a few hundred.
 MAX_KEYPOINTS = 10_000
-# Numbers beyond these are no places of a person: px from the first pixel, m from the origin.
+# Maximum coordinates of a person: px from the first pixel, and m from the origin.
 FARTHEST_PIXEL, FARTHEST_POSITION = 1e6, 1e3
 
 
 @dataclass(frozen=True)
 class Positions:
-    """Landmarks of a person in space, relative to each other, from a detector that lifts.
+    """Relative 3D positions of landmarks of a person, from a detector of 3D keypoints.
 
     Attributes:
-        names: (n,) of the landmarks.
-        positions: (n, 3) m, along the axes of the camera from an origin that all share; NaN where
-            there is none.
+        names: (n,) names of the landmarks.
+        positions: (n, 3) m, along the axes of the camera from a common origin; NaN if unknown.
     """
 
     names: tuple[str, ...]
     positions: Array
 
     def added_to(self, keypoints: Keypoints) -> Keypoints:
-        """The keypoints with the positions of the same names; NaN for those without."""
+        """Adds positions to the keypoints of the same names; others get NaN."""
         places = {name: i for i, name in enumerate(self.names)}
         positions = np.full((len(keypoints.names), 3), np.nan)
         for i, name in enumerate(keypoints.names):
@@ -57,16 +56,16 @@ def keypoints_of(message: Any, sigma_px: float = 0.0) -> Keypoints:
     """The content of an hmt_msgs/Keypoints2D, of `rosbags` or of ROS.
 
     Args:
-        sigma_px: standard deviation where the message has no covariance, px; 0: unknown.
+        sigma_px: standard deviation of keypoints without covariance, px; 0 if unknown.
 
     Returns:
-        The keypoints; those that were not seen have NaN as pixels, and confidence 0. Unknown
-        covariances are NaN. None at all where nobody was seen.
+        The keypoints, empty if nobody was seen. Unseen ones have NaN as pixels, and confidence 0.
+        Unknown covariances are NaN.
 
     Raises:
-        MessageError: a name twice, arrays whose lengths contradict each other, a position of which
-            one half is missing, or that is beyond all images, a covariance that is not positive
-            definite, a confidence beyond 0 to 1.
+        MessageError: a name that occurs twice, contradictory lengths of arrays, a position beyond
+            all images or with only one coordinate, a covariance that is not positive definite, or
+            a confidence outside of [0, 1].
     """
     names, pixels, confidences = _points_of(message, 'uv', 'keypoints')
     n = len(names)
@@ -83,16 +82,16 @@ def keypoints_of(message: Any, sigma_px: float = 0.0) -> Keypoints:
 def checked_keypoints(
     names: tuple[str, ...], pixels: Array, confidences: Array, covariances: Array | None = None
 ) -> Keypoints:
-    """Keypoints as a detector reports them; those that were not seen lose their other values.
+    """Checks the keypoints of a detector, and clears the other values of unseen ones.
 
     Args:
-        names: (n,), each once.
-        pixels: (n, 2) px; changed in place, like the others.
-        confidences: (n,).
-        covariances: (n, 2, 2) px^2; NaN: unknown of a keypoint, None: of all.
+        names: (n,) distinct names.
+        pixels: (n, 2) px; changed in place, like the other arrays.
+        confidences: (n,) confidences, 0 to 1.
+        covariances: (n, 2, 2) px^2; NaN if unknown for a keypoint, None if unknown for all.
 
     Raises:
-        MessageError: as `keypoints_of`.
+        MessageError: see `keypoints_of`.
     """
     seen = (confidences != 0) & ~np.isnan(pixels).all(1) & (pixels != 0).any(1)
     for i in np.flatnonzero(seen):
@@ -110,11 +109,11 @@ def checked_keypoints(
 def positions_of(message: Any) -> Positions:
     """The content of an hmt_msgs/Keypoints3D, of `rosbags` or of ROS.
 
-    A landmark has a position unless its confidence is 0; higher confidences all count the same
-    here. There are no landmarks where nobody was seen.
+    A landmark has a position unless its confidence is 0; the confidence has no other effect. The
+    result is empty if nobody was seen.
 
     Raises:
-        MessageError: as `keypoints_of`.
+        MessageError: see `keypoints_of`.
     """
     names, positions, confidences = _points_of(message, 'xyz', 'keypoints_3d')
     seen = (confidences != 0) & ~np.isnan(positions).all(1)
@@ -130,8 +129,8 @@ def keypoints_message(
     """hmt_msgs/Keypoints2D of an image with a stamp, in the optical frame of its camera.
 
     Args:
-        keypoints: maybe none: nobody was seen. Unknown covariances are NaN; a message has none if
-            all are unknown.
+        keypoints: keypoints, empty if nobody was seen. Unknown covariances are NaN; the message has
+            none if all are unknown.
         frame_id: optical frame of the camera.
     """
     known = bool(np.isfinite(keypoints.covariances).any())
@@ -149,7 +148,7 @@ def keypoints_message(
 def positions_message(
     messages: MessageFactory, keypoints: Keypoints, stamp_ns: int, frame_id: str
 ) -> Any:
-    """hmt_msgs/Keypoints3D of keypoints that have positions, else of none."""
+    """hmt_msgs/Keypoints3D of keypoints; empty if they have no positions."""
     names, positions = list(keypoints.names), keypoints.positions
     confidences = keypoints.confidences
     if positions is None:
@@ -166,7 +165,7 @@ def positions_message(
 
 
 def _points_of(message: Any, symbols: str, what: str) -> tuple[tuple[str, ...], Array, Array]:
-    """Names (n,), places (n, d) in the fields of so many symbols, and confidences (n,)."""
+    """Names (n,), coordinates (n, d) from d fields, and confidences (n,) of a message."""
     n = len(message.names)
     if n > MAX_KEYPOINTS:
         raise MessageError(f'{what} has {n} names, the limit is {MAX_KEYPOINTS}')
@@ -179,7 +178,7 @@ def _points_of(message: Any, symbols: str, what: str) -> tuple[tuple[str, ...], 
 
 
 def _check_point(name: str, place: Array, confidence: float, farthest: float, unit: str) -> None:
-    if not np.abs(place).max() <= farthest:  # or NaN
+    if not np.abs(place).max() <= farthest:  # also true for NaN
         raise MessageError(
             f'keypoint {name} lies at {tuple(place.tolist())}, wanted numbers within {farthest:g} '
             f'{unit}, or NaN for all of them where it was not seen'

@@ -1,11 +1,11 @@
-"""visualization_msgs: the modes of a mixture as skeletons, the lighter the fainter; the floor.
+"""visualization_msgs markers of the modes of a mixture as skeletons, and of the floor.
 
-A mode of rank k (0: the heaviest) has the namespace `mode_k` with two markers, 0 the bones and 1
-the joints. So a viewer replaces the markers of the last time, and ranks that are not used any more
-are deleted: every array speaks about all ranks.
+A mode of rank k (0 for the heaviest) has the namespace `mode_k` with two markers, 0 the bones and 1
+the joints; lighter modes are fainter. A viewer thus replaces earlier markers. Every array contains
+all ranks, and deletes the markers of unused ones.
 
-The floor is a translucent square in the namespace `floor`, the feet that stand on it are spheres in
-the namespace `contacts`, the less probable the fainter. Markers of unknown things are deleted.
+The floor is a translucent square in the namespace `floor`. Feet on the floor are spheres in the
+namespace `contacts`; less probable contacts are fainter. Markers of unknown objects are deleted.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ _ADD, _DELETE = 0, 2
 _CUBE, _LINE_LIST, _SPHERE_LIST = 1, 5, 7
 _BONES, _JOINTS = 0, 1
 
-# The heaviest mode is orange, the others are blue: both are told apart by colour-blind people.
+# The heaviest mode is orange, the others are blue, which colour-blind people can distinguish.
 _FIRST = (0.90, 0.45, 0.05)
 _OTHERS = (0.10, 0.45, 0.80)
 _FAINTEST = 0.12
 
 FLOOR, CONTACTS = 'floor', 'contacts'
-# Side and thickness of the square, m; its top is the floor.
+# Side and thickness of the square, whose top is the floor, m.
 _SIDE, _THICK = 3.0, 0.005
 _FLOOR_COLOUR = (0.55, 0.55, 0.50), 0.30
 _CONTACT_COLOUR = (0.00, 0.62, 0.45)
 _SPHERE = 0.09  # diameter, m
-# A foot that stands with a lower probability is not shown.
+# Minimum probability of a contact that is shown.
 _LEAST = 0.05
-# Joints of a foot, by the end of its name.
+# Suffixes of the names of the joints of a foot.
 _OF_FOOT = ('ankle', 'toe')
 
 
@@ -63,13 +63,13 @@ def skeleton_markers(
 
     Args:
         joint_positions: (K, J, 3) m.
-        edges: bones, as the names of the joints that they join.
-        weights: (K,) of the modes, in any order.
-        ranks: most modes that ever are shown; the lightest beyond are left out.
-        bone_width, joint_diameter: m.
+        edges: bones, as pairs of joint names.
+        weights: (K,) weights of the modes, in any order.
+        ranks: maximum number of shown modes; the lightest are left out.
+        bone_width, joint_diameter: sizes, m.
 
     Raises:
-        MessageError: arrays whose lengths contradict each other, an edge of an unknown joint.
+        MessageError: contradictory shapes of arrays, or an edge with an unknown joint.
     """
     positions = np.asarray(joint_positions, dtype=np.float64)
     heavy = np.asarray(weights, dtype=np.float64)
@@ -107,21 +107,21 @@ def trajectory_markers(
     namespace: str = 'trajectory',
     line_width: float = 0.01,
 ) -> Any:
-    """visualization_msgs/MarkerArray of M trajectories: the paths of some joints, the newest pose.
+    """visualization_msgs/MarkerArray of M trajectories: paths of some joints and the newest pose.
 
-    As `skeleton_markers`: a trajectory of rank k has the namespace `trajectory_k`, with the paths
+    Like `skeleton_markers`: a trajectory of rank k has the namespace `trajectory_k`, with the paths
     as marker 0 and the newest pose as marker 1.
 
     Args:
-        joint_positions: (M, T, J, 3) m, in the order of time.
-        traced: joints whose paths are drawn; those that are no joints are left out.
-        edges: bones, as the names of the joints that they join.
-        weights: (M,) of the trajectories, in any order.
-        ranks: most trajectories that ever are shown; the lightest beyond are left out.
-        line_width: m.
+        joint_positions: (M, T, J, 3) m, in temporal order.
+        traced: joints whose paths are drawn; unknown names are ignored.
+        edges: bones, as pairs of joint names.
+        weights: (M,) weights of the trajectories, in any order.
+        ranks: maximum number of shown trajectories; the lightest are left out.
+        line_width: width of lines, m.
 
     Raises:
-        MessageError: arrays whose lengths contradict each other, an edge of an unknown joint.
+        MessageError: contradictory shapes of arrays, or an edge with an unknown joint.
     """
     positions = np.asarray(joint_positions, dtype=np.float64)
     heavy = np.asarray(weights, dtype=np.float64)
@@ -163,9 +163,9 @@ def _ranked_markers(
     """visualization_msgs/MarkerArray of the heaviest modes, two markers each.
 
     Args:
-        weights: (K,) of the modes.
-        shown: fields of the two markers of a mode; those without points are deleted, as one point
-            alone is no line.
+        weights: (K,) weights of the modes.
+        shown: returns the fields of the two markers of a mode; markers without points are deleted,
+            for example the paths of a single pose.
     """
     blank = _marker(messages, header, action=_DELETE)
     order = np.argsort(-weights, kind='stable')[:ranks].tolist()
@@ -176,7 +176,6 @@ def _ranked_markers(
             pair = shown(order[rank])
             heaviest = float(weights[order[0]])
             share = float(weights[order[rank]]) / heaviest if heaviest > 0 else 1.0
-            # The lighter the fainter.
             alpha = _FAINTEST + (1 - _FAINTEST) * share
             colour = _colour(messages, _OTHERS if rank else _FIRST, alpha)
             pair = [
@@ -191,7 +190,7 @@ def _ranked_markers(
 
 
 def _marker(messages: MessageFactory, header: Any, **fields: Any) -> Any:
-    """visualization_msgs/Marker; viewers complain about an orientation of zero length."""
+    """Makes a visualization_msgs/Marker with a valid orientation, which viewers require."""
     fields.setdefault('pose', messages.create('geometry_msgs/msg/Pose'))
     return messages.create('visualization_msgs/msg/Marker', header=header, **fields)
 
@@ -201,7 +200,7 @@ def _size(messages: MessageFactory, diameter: float) -> Any:
 
 
 def _ends(joint_names: Sequence[str], edges: Sequence[tuple[str, str]]) -> list[int]:
-    """Indices of the joints at both ends of the bones, one after the other."""
+    """Indices of the joints at both ends of each bone, bone by bone."""
     index = {name: i for i, name in enumerate(joint_names)}
     for edge in edges:
         for name in edge:
@@ -219,9 +218,8 @@ def ground_markers(
     """visualization_msgs/Marker of the floor and of the contacts of one pose.
 
     Args:
-        joint_positions: (J, 3) m, in the frame of the content; the floor is drawn under their
-            middle.
-        joint_names: (J,); feet without joints of their side are left out.
+        joint_positions: (J, 3) m, in the frame of the content; the floor is drawn below their mean.
+        joint_names: (J,) names of the joints; feet without joints of their side are left out.
     """
     positions = np.asarray(joint_positions, dtype=np.float64)
     header = header_message(messages, content.stamp_ns, content.frame_id)
@@ -245,7 +243,7 @@ def ground_markers(
 
 
 def removed_ground(messages: MessageFactory, stamp_ns: int, frame_id: str) -> list[Any]:
-    """visualization_msgs/Marker that delete those of `ground_markers`."""
+    """visualization_msgs/Marker list that deletes the markers of `ground_markers`."""
     header = header_message(messages, stamp_ns, frame_id)
     return [_marker(messages, header, ns=name, action=_DELETE) for name in (FLOOR, CONTACTS)]
 
@@ -253,7 +251,7 @@ def removed_ground(messages: MessageFactory, stamp_ns: int, frame_id: str) -> li
 def _standing(
     content: GroundState, positions: Array, joint_names: Sequence[str]
 ) -> tuple[list[Array], list[float]]:
-    """Joints (3,) of the feet that may stand, m, and probabilities that they do."""
+    """Joints (3,) of feet that may be on the floor, m, and probabilities of contact."""
     places = {name: place for place, name in enumerate(joint_names)}
     points, shares = [], []
     for foot, probability in content.contacts.items():
@@ -267,7 +265,7 @@ def _standing(
 
 
 def _floor(messages: MessageFactory, header: Any, plane: Array, over: Array) -> Any:
-    """The square under a point (3,)."""
+    """The square of the floor below a point (3,)."""
     up, height = plane[:3], plane[3]
     across = np.eye(3)[np.argmin(np.abs(up))]
     x = across - (across * up).sum() * up

@@ -1,4 +1,4 @@
-"""`MessageError`, raised for contradictory messages, and the checks that the conversions share."""
+"""`MessageError`, raised for invalid messages, and the common checks of conversions."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Constant = TypeVar('Constant', bound=IntEnum)
 
-# Weights sum to 1 up to this.
+# Maximum deviation of the sum of weights from 1.
 WEIGHT_TOLERANCE = 1e-6
-# Covariances are symmetric up to this, relative to their largest entry.
+# Maximum asymmetry of covariances, relative to their largest entry.
 SYMMETRY_TOLERANCE = 1e-9
 
 
 class MessageError(ValueError):
-    """A message that can not be understood, in one line: what was seen and what was wanted.
+    """A message is invalid; one line with the value seen and the value wanted.
 
     Attributes:
-        fault: kind of the contradiction, in a word or two.
+        fault: kind of the fault, in a word or two.
     """
 
     def __init__(self, text: str, fault: str = 'contents') -> None:
@@ -32,7 +32,7 @@ class MessageError(ValueError):
 
 
 def numbers(values: Any, shape: tuple[int, ...], what: str) -> Array:
-    """Floats of a flat field of a message, in a shape.
+    """Converts a flat field of a message to an array of floats in a shape.
 
     Raises:
         MessageError: another number of values.
@@ -45,11 +45,11 @@ def numbers(values: Any, shape: tuple[int, ...], what: str) -> Array:
 
 
 def complete_mixture(record: Any, what: str) -> None:
-    """Makes names tuples, and identities numbers, in a frozen dataclass about a mixture.
+    """Checks names and identities of a frozen dataclass of a mixture, and sets their types.
 
     Raises:
-        MessageError: a name that is there twice, a segment length that is not finite, another
-            number of identities than of weights.
+        MessageError: a name that occurs twice, a segment length that is not finite, or different
+            numbers of identities and weights.
     """
     for name in ('dof_names', 'joint_names'):
         object.__setattr__(record, name, names_of(getattr(record, name), f'{what}: {name}'))
@@ -61,10 +61,10 @@ def complete_mixture(record: Any, what: str) -> None:
 def freeze_arrays(
     record: Any, shapes: Mapping[str, tuple[int, ...]], what: str, optional: Sequence[str] = ()
 ) -> None:
-    """Makes the attributes of a frozen dataclass read-only arrays of floats, in a shape each.
+    """Makes attributes of a frozen dataclass read-only arrays of floats, and checks their shapes.
 
     Args:
-        optional: names of attributes that may be None, and stay so.
+        optional: names of attributes that may be None.
 
     Raises:
         MessageError: another shape.
@@ -81,16 +81,16 @@ def freeze_arrays(
 
 
 def check_finite(values: Array, what: str) -> None:
-    """Raises MessageError where a value is NaN or infinite."""
+    """Raises MessageError if a value is NaN or infinite."""
     if not np.isfinite(values).all():
         raise MessageError(f'{what} has values that are not finite', 'not finite')
 
 
 def identities_of(values: NDArray[Any] | None, count: int, what: str) -> NDArray[np.uint32]:
-    """Identities (count,) of components, read-only; None: all 0.
+    """Read-only identities (count,) of components; None gives zeros.
 
     Raises:
-        MessageError: another number of them.
+        MessageError: another number of identities.
     """
     result = np.array(np.zeros(count) if values is None else values, dtype=np.uint32)
     if result.shape != (count,):
@@ -100,20 +100,20 @@ def identities_of(values: NDArray[Any] | None, count: int, what: str) -> NDArray
 
 
 def check_once(identities: NDArray[Any], what: str) -> None:
-    """Raises MessageError where an identity other than 0, no identity, is there twice."""
+    """Raises MessageError if an identity occurs twice; 0 means no identity."""
     known, counts = np.unique(identities[identities > 0], return_counts=True)
     if (counts > 1).any():
         raise MessageError(f'{what} has the identity {known[counts > 1][0]} twice', 'identities')
 
 
 def constant_of(kind: type[Constant], value: Any, fault: str) -> Constant:
-    """The constant of a message that a value is.
+    """The constant of a message with a value.
 
     Args:
         fault: text of the error.
 
     Raises:
-        MessageError: none has the value.
+        MessageError: no constant has the value.
     """
     try:
         return kind(int(value))
@@ -122,7 +122,7 @@ def constant_of(kind: type[Constant], value: Any, fault: str) -> Constant:
 
 
 def check_weights(weights: Array, what: str) -> None:
-    """Raises MessageError where weights are no probabilities."""
+    """Raises MessageError if weights are no probabilities, or do not sum to 1."""
     if not np.isfinite(weights).all() or (weights < 0).any():
         worst = weights[~(weights >= 0) | ~np.isfinite(weights)][0]
         raise MessageError(f'{what} has the weight {worst}, wanted numbers from 0 to 1', 'weights')
@@ -133,10 +133,10 @@ def check_weights(weights: Array, what: str) -> None:
 
 
 def check_covariances(covariances: Array, what: str, *, singular: bool = False) -> None:
-    """Raises MessageError where a covariance (..., d, d) is not symmetric and positive definite.
+    """Raises MessageError if a covariance is not symmetric and positive definite.
 
     Args:
-        covariances: (..., d, d).
+        covariances: (..., d, d) covariances.
         singular: whether they may be positive semidefinite.
     """
     check_finite(covariances, f'covariance of {what}')
@@ -163,10 +163,10 @@ def check_covariances(covariances: Array, what: str, *, singular: bool = False) 
 
 
 def names_of(values: Sequence[str], what: str) -> tuple[str, ...]:
-    """Names, each once.
+    """Names as a tuple.
 
     Raises:
-        MessageError: a name that is there twice.
+        MessageError: a name that occurs twice.
     """
     names = tuple(str(value) for value in values)
     if len(set(names)) < len(names):
@@ -176,7 +176,7 @@ def names_of(values: Sequence[str], what: str) -> tuple[str, ...]:
 
 
 def check_names(names: tuple[str, ...], wanted: Sequence[str] | None, what: str) -> None:
-    """Raises MessageError where names are not those wanted, in their order; None: any will do."""
+    """Raises MessageError if names differ from the wanted ones or their order; None skips this."""
     if wanted is None or names == tuple(wanted):
         return
     if len(names) != len(wanted):
@@ -186,7 +186,7 @@ def check_names(names: tuple[str, ...], wanted: Sequence[str] | None, what: str)
 
 
 def array_of_each(components: Sequence[Any], name: str, shape: tuple[int, ...], what: str) -> Array:
-    """A flat field of each of K components, (K, *shape).
+    """A flat field of K components as an array (K, *shape).
 
     Raises:
         MessageError: another number of values.
@@ -202,10 +202,10 @@ def array_of_each(components: Sequence[Any], name: str, shape: tuple[int, ...], 
 def array_of_all(
     components: Sequence[Any], name: str, shape: tuple[int, ...], what: str
 ) -> Array | None:
-    """A field (K, *shape) that all components have or none has; None: none.
+    """A field (K, *shape) of all components; None if no component has it.
 
     Raises:
-        MessageError: some have it and others not, or another number of values.
+        MessageError: only some components have it, or another number of values.
     """
     lengths = [len(getattr(component, name)) for component in components]
     if not any(lengths):
@@ -217,7 +217,7 @@ def array_of_all(
 
 
 def flat(values: Array | None, component: int) -> Array:
-    """Row-major values of a component; empty: unknown."""
+    """Row-major values of a component; empty if unknown."""
     return np.empty(0) if values is None else values[component].reshape(-1)
 
 
@@ -227,10 +227,10 @@ def lengths_of(message: Any, what: str) -> dict[str, float]:
 
 
 def named_numbers(message: Any, names: str, values: str, what: str) -> dict[str, float]:
-    """The numbers in a field of a message, by the names in another; empty where it has none.
+    """The numbers in a field of a message, by the names in another field; may be empty.
 
     Raises:
-        MessageError: a name that is there twice, another number of values than of names.
+        MessageError: a name that occurs twice, or different numbers of values and names.
     """
     keys = names_of(getattr(message, names), f'{what}: {names}')
     found = numbers(getattr(message, values), (len(keys),), f'{what}: {values}')
@@ -238,5 +238,5 @@ def named_numbers(message: Any, names: str, values: str, what: str) -> dict[str,
 
 
 def check_lengths(lengths: Mapping[str, float], what: str) -> None:
-    """Raises MessageError where a segment length is not finite."""
+    """Raises MessageError if a segment length is not finite."""
     check_finite(np.array(list(lengths.values()), dtype=np.float64), f'{what}: segment_lengths')

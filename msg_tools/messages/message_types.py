@@ -1,12 +1,12 @@
-"""Message types for work without ROS, and one way to make messages of both families of classes.
+"""Message types for use without ROS, and one interface to make messages of both kinds of classes.
 
-The types are those of ROS 2 Jazzy and hmt_msgs. The .msg files in `hmt_msgs/` are the one
+The types are those of ROS 2 Jazzy and hmt_msgs. The .msg files in `hmt_msgs/` are their only
 definition: colcon generates the classes of the nodes from them, and this module the classes that
 `rosbags` serialises.
 
-Offline work has the classes of `rosbags`, whose arrays are numpy arrays and whose fields all have
-to be given; a node has the classes that ROS generates, whose sequences are `array.array`. The
-functions that turn arrays into messages take a `MessageFactory` and work for both.
+Offline code uses the classes of `rosbags`, which have numpy arrays and need a value for every
+field. Nodes use the classes that ROS generates, which have sequences of type `array.array`.
+Functions that convert arrays to messages get a `MessageFactory` and work for both.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @cache
 def typestore() -> Typestore:
-    """All types that the project reads and writes; the same object every time."""
+    """All types that the project reads and writes; always the same object."""
     store = get_typestore(Stores.ROS2_JAZZY)
     with resources.as_file(resources.files('msg_tools') / 'hmt_msgs' / 'msg') as folder:
         store.register(_types_in('hmt_msgs', folder))
@@ -51,32 +51,32 @@ def register_definitions(package: str, folder: Path) -> None:
     """Adds the messages of another package to `typestore()`.
 
     Raises:
-        ValueError: a file that can not be understood.
+        ValueError: a file can not be parsed.
     """
     try:
         types, store = _types_in(package, folder), typestore()
         store.register({name: x for name, x in types.items() if name not in store.fielddefs})
     except Exception as error:
-        # The parser meets any text here, and does not say what it may raise.
+        # The parser reads untrusted text here, and its exceptions are not documented.
         raise ValueError(f'the messages of {package} in {folder} can not be understood') from error
 
 
 def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typestore:
-    """Types for messages that carry their own definition, as those of a bag do.
+    """Types for messages that have their own definition, such as those of a bag.
 
-    A bag may hold types that nobody else knows, or an older version of a known one; its messages
-    have to be read with its own definition.
+    A bag may contain unknown types, or an older version of a known type; its messages must be read
+    with its own definition.
 
     Args:
-        msgtype: for example 'sensor_msgs/msg/Image'.
-        encoding: 'ros2msg'; for known types, another or '' leads to the known definition.
-        definition: text of the definition, with those of the nested types.
+        msgtype: type, for example 'sensor_msgs/msg/Image'.
+        encoding: 'ros2msg'; for known types, another or '' selects the known definition.
+        definition: text of the definition, including those of the nested types.
 
     Returns:
-        `typestore()` itself when it agrees with the definition.
+        The types; `typestore()` itself if it agrees with the definition.
 
     Raises:
-        ValueError: the type is not known and the definition can not be understood.
+        ValueError: the type is unknown and the definition is invalid, or too large to be used.
     """
     known = typestore()
     ours = msgtype in known.fielddefs
@@ -105,15 +105,15 @@ def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typ
     try:
         own.register(changed)
     except Exception as error:
-        # The generator of code does not say what it may raise.
+        # The exceptions of the code generator are not documented.
         raise ValueError('its definition can not be used') from error
     return own
 
 
 def _same_fields(name: str, types: Types, known: Typestore) -> bool:
-    """Whether a definition has the fields of the known one.
+    """Whether a type has the same fields as the known type of its name.
 
-    Names are compared without case: the first ROS 2 releases wrote D, K, R, P in CameraInfo.
+    Names are compared without case, because CameraInfo had D, K, R, P in early ROS 2 releases.
     """
     ours: Any = known.fielddefs.get(name, ((), ()))[1]
     return [(field.lower(), kind) for field, kind in types[name]] == [
@@ -122,13 +122,13 @@ def _same_fields(name: str, types: Types, known: Typestore) -> bool:
 
 
 def adopted(value: Any, types: Typestore) -> Any:
-    """A message of an older definition of its type as one of `typestore()`.
+    """Converts a message of an older definition of its type to one of `typestore()`.
 
-    Fields that it does not have are zero or empty.
+    Missing fields are zero or empty.
 
     Args:
         value: the message, or the value of one of its fields.
-        types: by which it was read.
+        types: types with which it was read.
 
     Raises:
         ValueError: a field that the type of `typestore()` does not have.
@@ -149,20 +149,20 @@ _POINT = 'geometry_msgs/msg/Point'
 
 
 class MessageFactory(Protocol):
-    """Makes messages by the name of their type, for example 'hmt_msgs/msg/PoseMixture'."""
+    """Makes messages given the name of their type, for example 'hmt_msgs/msg/PoseMixture'."""
 
     def create(self, msgtype: str, **fields: Any) -> Any:
-        """A message with some fields given, the others zero or empty (quaternions: no rotation).
+        """Makes a message; fields that are not given are zero or empty (identity for quaternions).
 
         Numpy arrays are converted to the type of the field.
         """
 
     def points(self, positions: NDArray[np.float64]) -> list[Any]:
-        """geometry_msgs/Point of positions (N, 3): as `create`, of which there would be many."""
+        """Makes geometry_msgs/Point of positions (N, 3), faster than calls of `create`."""
 
 
 class RosbagsMessages:
-    """Messages of `typestore()`, for bags and everything else without ROS."""
+    """Makes messages of `typestore()`, for bags and all other use without ROS."""
 
     def create(self, msgtype: str, **fields: Any) -> Any:
         """See `MessageFactory.create`.
@@ -188,10 +188,10 @@ class RosbagsMessages:
 
 
 class GeneratedMessages:
-    """Messages of the classes that ROS generates; a node hands over those that it uses.
+    """Makes messages of the classes that ROS generates.
 
     Args:
-        classes: for example `[hmt_msgs.msg.PoseMixture, std_msgs.msg.Header]`.
+        classes: classes in use, for example `[hmt_msgs.msg.PoseMixture, std_msgs.msg.Header]`.
     """
 
     def __init__(self, classes: Iterable[type]) -> None:
@@ -207,7 +207,7 @@ class GeneratedMessages:
         """See `MessageFactory.create`.
 
         Raises:
-            KeyError: a type whose class was not handed over.
+            KeyError: the class of the type was not given.
         """
         kinds = self._kinds[msgtype]
         for name, value in fields.items():
@@ -241,7 +241,7 @@ _TYPE_CODES = {
 
 
 def _sequence(value: NDArray[Any], kind: str) -> Any:
-    """The array that a generated class takes without looking at every element."""
+    """The array type that a generated class accepts without a check of every element."""
     code = _TYPE_CODES[kind.removeprefix('sequence<').removesuffix('>').partition(',')[0]]
     result = array.array(code)
     result.frombytes(np.ascontiguousarray(value, dtype=code).tobytes())
@@ -258,7 +258,7 @@ _ZEROS: dict[str, Callable[[], Any]] = {
 
 @cache
 def _defaults(msgtype: str) -> dict[str, tuple[Callable[[], Any], str | None]]:
-    """For each field the maker of its default, and the dtype where it is an array of numbers."""
+    """Factory of the default of each field, and its dtype if it is an array of numbers."""
     result: dict[str, tuple[Callable[[], Any], str | None]] = {}
     fields: Any = typestore().fielddefs[msgtype][1]
     for name, (kind, detail) in fields:

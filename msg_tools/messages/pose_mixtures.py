@@ -1,6 +1,6 @@
 """hmt_msgs/PoseMixture: a mixture over the pose of a body, as arrays.
 
-`pose_mixture_of` is the one reader of the message, and `pose_mixture_message` the one writer.
+`pose_mixture_of` is the only reader of the message, and `pose_mixture_message` the only writer.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ from msg_tools.messages.message_error import (
 from msg_tools.messages.message_types import MessageFactory
 
 POSE_MIXTURE = 'hmt_msgs/msg/PoseMixture'
-# No node publishes more components; a message with millions would block its reader.
+# Maximum number of components; a message with millions would block its reader.
 MAX_COMPONENTS = 1024
-# Arrays that only a likelihood has, and those of joints; they may be unknown.
+# Arrays that only likelihoods have, and arrays of joints; both may be unknown.
 OF_LIKELIHOODS = ('shape_covariance', 'posterior_weights', 'ancestry')
 OF_JOINTS = ('joint_covariances', 'joint_covariances_relative', 'joint_velocities')
 
 
 class MixtureKind(IntEnum):
-    """The density that a mixture stands for; the constants of PoseMixture.msg."""
+    """The density that a mixture represents; the constants of PoseMixture.msg."""
 
     POSTERIOR = 0
     LIKELIHOOD = 1
@@ -75,49 +75,49 @@ class PoseMixture:
     """The content of the message: K components over d degrees of freedom.
 
     Attributes:
-        weights: (K,) sum to 1; K = 0: nobody was seen.
+        weights: (K,) weights that sum to 1; K = 0 if nobody was seen.
         means: (K, d) poses, m and rad.
-        covariances: (K, d, d) positive definite; None: unknown.
+        covariances: (K, d, d) positive definite; None if unknown.
         body_model: name of the body.
         dof_names: (d,) order of the variables.
         joint_names: (J,) order of the joints.
         joint_positions: (K, J, 3) m, at the means, in the frame of the header.
         kind: see `MixtureKind`.
-        stamp_ns: of the image.
+        stamp_ns: stamp of the image.
         frame_id: optical frame of the camera.
-        segment_lengths: m, by name: the person's body is the model at these lengths. Empty:
-            unknown, as in messages of other publishers; the body is then the one of the Body topic,
-            or the model at its own lengths.
-        log_likelihoods: (K,) log p(image | mean) up to a constant; NaN: unknown. None: all unknown.
-        degrees_of_freedom: (K,) of Student components; 0: Gaussian. None: all Gaussian.
-        state: of the track, see `TrackState`.
-        track_id: number of the track, from 1 on; 0: belongs to no track.
-        identities: (K,) of the components, which last from image to image within a track, from 1
-            on; 0: no identity. None: all without.
-        joint_covariances: (K, J, 3, 3) m^2, of the joint positions; None: unknown.
+        segment_lengths: segment lengths by name, m, which replace those of the body model. Empty
+            if unknown, as in messages of other publishers; the body is then that of the Body topic,
+            or else the unchanged model.
+        log_likelihoods: (K,) log p(image | mean) up to a constant; NaN if unknown, None if all are.
+        degrees_of_freedom: (K,) of Student components; 0 for Gaussian, None if all are Gaussian.
+        state: state of the track, see `TrackState`.
+        track_id: number of the track, from 1; 0 if the mixture belongs to no track.
+        identities: (K,) identities of the components, constant from image to image within a track,
+            from 1; 0 for no identity, None if no component has one.
+        joint_covariances: (K, J, 3, 3) m^2, of the joint positions; None if unknown.
         joint_covariances_relative: (K, J, 3, 3) m^2, of the joint positions relative to the first
-            joint, whose own are 0; None: unknown.
-        joint_velocities: (K, J, 3) m/s, in the frame of the header; None: unknown.
-        existence_probability: that a person is in view, given all images so far; NaN: unknown, as
-            in messages of other publishers.
-        cue_probabilities: that each cue of the images shows the person, by the name of the cue; of
-            the name 'track', that some component is about where the person is. Empty: unknown, as
-            in all but posteriors of the filter.
-        error_share: share of the evidence of one image that is independent, in (0, 1], beside a
-            likelihood; NaN: unknown.
-        error_time: time for which errors last, s; NaN: unknown.
-        shape_covariance: (d, d) of the errors shared by poses of all images, as the lengths and
-            the flesh of the person are not known exactly, beside a likelihood; None: unknown.
-        reason: what is missing where the pose is not known; '' where nothing is.
-        posterior_weights: (K,) of the components, given all images so far, beside a likelihood of
-            the filter; they sum to 1. None: unknown.
-        ancestry: (K, M) probability that each component continues component m of the likelihood of
-            the image before; each row sums to 1. M = 0: the modes begin. None: unknown.
-        ancestry_stamp_ns: of that likelihood; 0: unknown, or there is none.
-        ancestry_ids: (M,) its identities; None: none.
+            joint, whose own are 0; None if unknown.
+        joint_velocities: (K, J, 3) m/s, in the frame of the header; None if unknown.
+        existence_probability: probability that a person is in view, given all images so far; NaN
+            if unknown, as in messages of other publishers.
+        cue_probabilities: probability that each image cue shows the person, by the name of the cue;
+            'track' is the probability that some component is near the person. Empty if unknown;
+            only posteriors of the filter have them.
+        error_share: independent fraction of the evidence of one image, in (0, 1], for a likelihood;
+            NaN if unknown.
+        error_time: correlation time of errors, s; NaN if unknown.
+        shape_covariance: (d, d) covariance of the pose errors that all images share because lengths
+            and flesh of the person are not known exactly, for a likelihood; None if unknown.
+        reason: reason why the pose is unknown; '' if it is known.
+        posterior_weights: (K,) weights of the components given all images so far, which sum to 1,
+            for a likelihood of the filter; None if unknown.
+        ancestry: (K, M) probability that each component continues component m of the previous
+            likelihood; each row sums to 1. M = 0 for new modes; None if unknown.
+        ancestry_stamp_ns: stamp of the previous likelihood; 0 if unknown or missing.
+        ancestry_ids: (M,) identities of the previous likelihood; None if there is none.
 
     Raises:
-        MessageError: shapes or values that a message must not have.
+        MessageError: invalid shapes or values.
     """
 
     weights: Array
@@ -203,7 +203,7 @@ class PoseMixture:
             check_covariances(self.shape_covariance, 'the shape', singular=True)
 
     def _check_chain(self, ancestry_ids: NDArray[np.uint32]) -> None:
-        """Raises MessageError where posterior weights and ancestry are no probabilities."""
+        """Raises MessageError if posterior weights or ancestry are no probabilities."""
         assert self.identities is not None
         if len(self.weights) and self.posterior_weights is not None:
             check_weights(self.posterior_weights, 'mixture: posterior')
@@ -242,26 +242,25 @@ class PoseMixture:
         ancestry_stamp_ns: int = 0,
         ancestry_ids: NDArray[Any] | None = None,
     ) -> PoseMixture:
-        """A mixture over the poses of a body at its present lengths.
+        """A mixture over the poses of a body with its current segment lengths.
 
-        Covariances and velocities of the joints are those of the poses by linearisation,
+        Covariances and velocities of the joints are linearised from those of the poses,
 
             S_joint = J S J',    v_joint = J v,    J = d joint / d pose at the mean
 
-        and those relative to the pelvis, which is the first joint, have J - J_pelvis for J.
+        and those relative to the pelvis, the first joint, have J - J_pelvis in place of J.
+
+        The other arguments are those of the attributes.
 
         Args:
-            mixture: K Gaussians over its poses; None: nobody was seen. Root angles of the message
-                are measured against the camera, whatever the level of the body.
-            joint_positions: (K, J, 3) m, of the means; None: computed here.
-            kind, stamp_ns, frame_id, log_likelihoods, state, track_id, identities,
-                existence_probability, error_share, error_time, shape_covariance, reason,
-                posterior_weights, ancestry, ancestry_stamp_ns, ancestry_ids: see the attributes.
-            velocities: (K, d) of the poses, per second; None: unknown.
-            cue_probabilities: see the attributes; None: unknown.
+            mixture: K Gaussians over its poses; None if nobody was seen. Root angles of the message
+                are relative to the camera, even if the body is levelled.
+            joint_positions: (K, J, 3) m, of the means; None computes them.
+            velocities: (K, d) velocities of the poses, per second; None if unknown.
+            cue_probabilities: see the attributes; None if unknown.
 
         Raises:
-            MessageError: shapes or values that a message must not have.
+            MessageError: invalid shapes or values.
         """
         if mixture is None:
             d = body.dimension
@@ -325,11 +324,11 @@ class PoseMixture:
 
 
 def _joint_covariances(body: Body, jacobians: Array, covariances: Array) -> Array:
-    """Covariances (K, J, 3, 3) of joints: of the poses, and of the body model in every pose.
+    """Covariances (K, J, 3, 3) of joints, from the poses and from errors of the body model.
 
     Args:
-        jacobians: (K, J, 3, d) of the positions.
-        covariances: (K, d, d) of the poses.
+        jacobians: (K, J, 3, d) Jacobians of the positions.
+        covariances: (K, d, d) covariances of the poses.
     """
     k, joints, _, d = jacobians.shape
     rows = product(jacobians.reshape(k, 3 * joints, d), covariances).reshape(jacobians.shape)
@@ -339,7 +338,7 @@ def _joint_covariances(body: Body, jacobians: Array, covariances: Array) -> Arra
 
 
 def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:
-    """hmt_msgs/PoseMixture; the components heaviest first, of equal weights in their order."""
+    """Makes an hmt_msgs/PoseMixture with the components in order of falling weight."""
     assert content.log_likelihoods is not None
     assert content.degrees_of_freedom is not None
     assert content.identities is not None
@@ -395,15 +394,15 @@ def pose_mixture_of(
 ) -> PoseMixture:
     """The content of an hmt_msgs/PoseMixture, of `rosbags` or of ROS.
 
-    A message without components (nobody was seen), without covariances or without segment lengths
-    (see `PoseMixture`) is understood; `PoseMixture.mixture` wants the first two.
+    A message may be without components (nobody was seen), without covariances or without segment
+    lengths (see `PoseMixture`); `PoseMixture.mixture` needs the first two.
 
     Args:
-        dof_names, joint_names: that it has to have, in this order; None: any.
+        dof_names, joint_names: required names in this order; None accepts any.
 
     Raises:
-        MessageError: names that differ, arrays whose lengths contradict each other, weights that
-            are no probabilities, covariances that are not positive definite.
+        MessageError: other names, contradictory lengths of arrays, weights that are no
+            probabilities, or covariances that are not positive definite.
     """
     names = names_of(message.dof_names, 'mixture: dof_names')
     joints = names_of(message.joint_names, 'mixture: joint_names')
@@ -463,20 +462,20 @@ def pose_mixture_of(
 
 
 def _existence(message: Any, state: TrackState) -> float:
-    """The probability of existence; NaN where a publisher leaves it alone, and so 0."""
+    """The probability of existence; NaN if a publisher has not set it, and it is 0."""
     value = float(message.existence_probability)
     return math.nan if state is TrackState.UNKNOWN and value == 0.0 else value
 
 
 def _errors(message: Any) -> dict[str, Any]:
-    """The error model; none where a publisher leaves it alone, and so 0."""
+    """The error model; empty if a publisher has not set it, and it is 0."""
     if message.error_share == 0.0:
         return {}
     return {'error_share': float(message.error_share), 'error_time': float(message.error_time)}
 
 
 def _chain(message: Any) -> dict[str, Any]:
-    """Weights and ancestry; none where a publisher leaves them alone, and so 0 or empty."""
+    """Weights and ancestry; None if a publisher has not set them, and they are 0 or empty."""
     weights = np.array([c.posterior_weight for c in message.components])
     told, ids = np.nan_to_num(weights).any(), message.ancestry_ids
     rows = array_of_each(message.components, 'ancestry', (len(ids),), 'mixture')
@@ -489,6 +488,6 @@ def _chain(message: Any) -> dict[str, Any]:
 
 
 def _shape_covariance(message: Any, d: int) -> Array | None:
-    """The field (d, d); None where it is empty."""
+    """The shape covariance (d, d); None if it is empty."""
     values = message.shape_covariance
     return numbers(values, (d, d), 'mixture: shape_covariance') if len(values) else None

@@ -1,6 +1,6 @@
-"""Poses under the names of the joints of the URDF, and as transforms: for viewers and robots.
+"""Poses for viewers and robots, as sensor_msgs/JointState and tf2_msgs/TFMessage.
 
-sensor_msgs/JointState and tf2_msgs/TFMessage.
+The names in joint states are those of the joints of the URDF.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ def joint_state_message(
     stamp_ns: int,
     frame_id: str = '',
 ) -> Any:
-    """sensor_msgs/JointState of a pose (d,): positions only, m or rad.
+    """sensor_msgs/JointState of a pose (d,) with positions only, m or rad.
 
     Raises:
-        MessageError: not one position for each name.
+        MessageError: the number of positions differs from that of names.
     """
     position = np.asarray(pose, dtype=np.float64)
     if position.shape != (len(dof_names),):
@@ -45,7 +45,7 @@ def joint_state_message(
 
 
 def heaviest_joint_state(messages: MessageFactory, content: PoseMixture) -> Any:
-    """sensor_msgs/JointState of the heaviest component of a mixture that has components."""
+    """sensor_msgs/JointState of the heaviest component of a non-empty mixture."""
     return joint_state_message(
         messages,
         content.dof_names,
@@ -73,7 +73,7 @@ def quaternions(rotations: ArrayLike) -> Array:
 
 
 def pose_message(messages: MessageFactory, place: ArrayLike, turn: ArrayLike) -> Any:
-    """geometry_msgs/Pose of a place (3,), m, and a quaternion (4,) x, y, z, w."""
+    """geometry_msgs/Pose of a position (3,), m, and a quaternion (4,) x, y, z, w."""
     px, py, pz = np.asarray(place, dtype=np.float64).tolist()
     x, y, z, w = np.asarray(turn, dtype=np.float64).tolist()
     return messages.create(
@@ -91,15 +91,15 @@ def transforms_message(
     translations: ArrayLike,
     stamp_ns: int,
 ) -> Any:
-    """tf2_msgs/TFMessage.
+    """Makes a tf2_msgs/TFMessage.
 
     Args:
         parents, children: (N,) names of frames.
-        rotations: (N, 3, 3) and
-        translations: (N, 3), m: p_parent = R p_child + t.
+        rotations: (N, 3, 3) R in p_parent = R p_child + t.
+        translations: (N, 3) t, m.
 
     Raises:
-        MessageError: arrays whose lengths contradict each other, values that are not finite.
+        MessageError: contradictory lengths of arrays, or values that are not finite.
     """
     r = np.asarray(rotations, dtype=np.float64)
     t = np.asarray(translations, dtype=np.float64)

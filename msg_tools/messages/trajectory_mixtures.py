@@ -35,25 +35,25 @@ class TrajectoryMixture:
     """The content of the message: M trajectories of T poses with d degrees of freedom.
 
     Attributes:
-        weights: (M,) sum to 1.
-        means: (M, T, d).
-        marginal_covariances: (M, T, d, d), inflation included; None: not computed.
+        weights: (M,) weights that sum to 1.
+        means: (M, T, d) poses, m and rad.
+        marginal_covariances: (M, T, d, d) including the inflation; None if not computed.
         log_joint: (M,) log p(trajectory, images) at the mean.
         inflation: (M,) factor on the standard deviations.
         stamps_ns: (T,) times of the poses, increasing.
         final_until_ns: poses at or before this time will not be revised.
-        free_energy: (I,) per iteration, nats.
+        free_energy: (I,) free energy per iteration, nats.
         body_model: name of the body.
         dof_names: (d,) order of the variables.
         frame_id: optical frame of the camera.
-        segment_lengths: m, by name, as in `PoseMixture`; empty: unknown.
+        segment_lengths: segment lengths by name, m, see `PoseMixture`; empty if unknown.
         joint_names: (J,) order of the joints.
-        joint_positions: (M, T, J, 3) m, at the means; None: not computed.
-        identities: (M,) of the motions, which last within a track, from 1 on; 0: no identity. None:
-            all without.
+        joint_positions: (M, T, J, 3) m, at the means; None if not computed.
+        identities: (M,) identities of the motions, constant within a track, from 1; 0 for no
+            identity, None if no component has one.
 
     Raises:
-        MessageError: shapes or values that a message must not have.
+        MessageError: invalid shapes or values.
     """
 
     weights: Array
@@ -100,7 +100,7 @@ class TrajectoryMixture:
 
 
 def trajectory_mixture_message(messages: MessageFactory, content: TrajectoryMixture) -> Any:
-    """hmt_msgs/TrajectoryMixture; components heaviest first, of equal weights in their order."""
+    """Makes an hmt_msgs/TrajectoryMixture with the components in order of falling weight."""
     assert content.identities is not None
     components = [
         messages.create(
@@ -122,7 +122,7 @@ def trajectory_mixture_message(messages: MessageFactory, content: TrajectoryMixt
         dof_names=list(content.dof_names),
         joint_names=list(content.joint_names),
         stamps=[time_message(messages, stamp) for stamp in content.stamps_ns],
-        # Before the first of all stamps there is none.
+        # A message can have no earlier stamp.
         final_until=time_message(messages, max(content.final_until_ns, EARLIEST_NS)),
         free_energy=content.free_energy,
         components=components,
@@ -137,11 +137,11 @@ def trajectory_mixture_of(
     """The content of an hmt_msgs/TrajectoryMixture, of `rosbags` or of ROS.
 
     Args:
-        dof_names: that it has to have, in this order; None: any.
+        dof_names: required names in this order; None accepts any.
 
     Raises:
-        MessageError: names that differ, arrays whose lengths contradict each other, weights that
-            are no probabilities, covariances that are not positive definite, stamps that do not
+        MessageError: other names, contradictory lengths of arrays, weights that are no
+            probabilities, covariances that are not positive definite, or stamps that do not
             increase.
     """
     names = names_of(message.dof_names, 'trajectories: dof_names')

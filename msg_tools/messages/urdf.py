@@ -1,13 +1,14 @@
-"""A body as a URDF, so that any viewer of ROS shows it and moves it by joint states.
+"""A body as a URDF, so that any ROS viewer can show it and move it by joint states.
 
-URDF knows joints of one degree of freedom only, so a segment with several becomes a chain of links,
-of which the last bears the name of the segment. The joints are named as the degrees of freedom.
-Seen from its parent a segment is
+URDF has only joints of one degree of freedom, so a segment with several becomes a chain of links;
+the last link has the name of the segment. The joints have the names of the degrees of freedom. The
+transform from a segment to its parent is
 
     Trans(offset + translations) * mount * Rot(axis_1, q_1) * ... * Rot(axis_n, q_n)
 
-as in `hmt_ros.body.skeleton`. Links have no inertia: the URDF is for looking at. `link_frames`
-gives the frames of all links, also of those within a chain: viewers complain of links without one.
+as in `hmt_ros.body.skeleton`. Links have no inertia, because the URDF is only for viewers.
+`link_frames` gives the frames of all links, also those within a chain: viewers warn about links
+without a frame.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from hmt_ros.core import elementary
 from hmt_ros.inference.linear_algebra import product
 from msg_tools.messages.message_error import Array, MessageError
 
-# URDF wants limits with every joint that has a range; these stand for none.
+# Limit in place of none, because URDF requires one for such joints, m or rad.
 _UNLIMITED = 1000.0
 _AXES = ('1 0 0', '0 1 0', '0 0 1')
 
@@ -35,16 +36,16 @@ _AXES = ('1 0 0', '0 1 0', '0 0 1')
 def body_urdf(
     skeleton: Skeleton, root_link: str, rod_radius: float = 0.025, link_prefix: str = ''
 ) -> str:
-    """The URDF of a skeleton at its present lengths; the same text for the same body.
+    """The URDF of a skeleton with its current lengths; equal bodies give equal text.
 
     Args:
-        skeleton: whose segments are shown as rods to their ends.
-        root_link: parent of the segments without one: the frame of the camera.
-        rod_radius: m.
-        link_prefix: stands before the names of all links but the root.
+        skeleton: skeleton whose segments are shown as rods to their ends.
+        root_link: link of the camera, the parent of segments without a parent.
+        rod_radius: radius of the rods, m.
+        link_prefix: prefix of the names of all links except the root.
 
     Raises:
-        MessageError: a name that is there twice.
+        MessageError: a name that occurs twice.
     """
     robot = ET.Element('robot', name=skeleton.name)
     ET.SubElement(robot, 'link', name=root_link)
@@ -71,9 +72,9 @@ def _add_segment(
     rod_radius: float,
     link_prefix: str,
 ) -> None:
-    """Adds the links and joints that lead from a parent link to a segment."""
+    """Adds the links and joints between a parent link and a segment."""
     name, offset = skeleton.segment_names[index], skeleton.offsets[index]
-    # Degrees of freedom; None: a fixed joint. The mount stands before the first rotation.
+    # Degrees of freedom, or None for a fixed joint. The mount precedes the first rotation.
     steps: list[int | None] = list(skeleton.segment_dofs[index])
     if not any(skeleton.dof_is_rotation[i] for i in skeleton.segment_dofs[index]):
         steps.append(None)
@@ -112,20 +113,20 @@ def _kind(skeleton: Skeleton, dof: int | None) -> str:
 def link_frames(
     skeleton: Skeleton, frames: Frames, pose: ArrayLike, index: int = 0
 ) -> tuple[list[str], Array, Array]:
-    """Where the links of `body_urdf` are, all but the root, which is the camera.
+    """Computes the frames of the links of `body_urdf` except the root, which is the camera.
 
     Args:
-        pose: (d,) that they belong to.
-        index: of the pose among those of the frames.
+        pose: (d,) pose of the body.
+        index: index of the pose in the frames.
 
     Returns:
-        Names of the links (L), as `body_urdf` gives them without a prefix; rotations (L, 3, 3) and
-        origins (L, 3), m, in the frame of the camera.
+        Names of the links (L), as in `body_urdf` without a prefix; rotations (L, 3, 3) and origins
+        (L, 3), m, in the frame of the camera.
     """
     q = np.asarray(pose, dtype=np.float64)
     turned = frames.rotations()[index]
     origins = np.ascontiguousarray(frames.origins[:, :, index])
-    # The inverse of a rotation: a turn by -q about its axis, which it does not move itself.
+    # The inverse of each rotation is a rotation by -q about its own axis, which stays fixed.
     back = rotations_of(-q[:, None] * frames.axes[:, :, index])
     names: list[str] = []
     rotations: list[Array] = []
@@ -133,7 +134,7 @@ def link_frames(
     for segment, name in enumerate(skeleton.segment_names):
         own = skeleton.segment_dofs[segment]
         chain = [(name, turned[segment], origins[segment])]
-        # From the segment towards its parent; the links of its translations do not turn.
+        # From the segment to its parent; links of translations have the rotation of the parent.
         rotation, place = turned[segment], origins[segment]
         parent = skeleton.parents[segment]
         unturned = np.eye(3) if parent == -1 else turned[parent]
@@ -141,7 +142,7 @@ def link_frames(
         for position in reversed(range(len(own))):
             dof = own[position]
             if position == len(own) - 1 and turns:
-                # The last rotation ends in the segment itself.
+                # The link of the last rotation is the segment itself.
                 rotation = product(back[dof], rotation)
                 continue
             link = f'{name}.{skeleton.dof_names[dof]}'
@@ -159,17 +160,17 @@ def link_frames(
 
 
 def add_limit(joint: ET.Element, lower: float, upper: float) -> None:
-    """Limits a joint, m or rad."""
+    """Adds the limits of a joint, m or rad."""
     bounds = {'lower': repr(lower), 'upper': repr(upper)}
     ET.SubElement(joint, 'limit', bounds | {'effort': '1000.0', 'velocity': '100.0'})
 
 
 def add_rod(link: ET.Element, end: Array, radius: float) -> None:
-    """Shows a rod in a link, from its origin to an end (3,), m; none where they are one point."""
+    """Adds a rod to a link, from its origin to an end (3,), m, unless both are one point."""
     length = float(np.linalg.norm(end, axis=0))
     if length < 1e-6:
         return
-    # A cylinder of URDF lies along z: pitch and yaw turn z into the direction of the rod.
+    # A cylinder in URDF is along z; pitch and yaw rotate z to the direction of the rod.
     x, y, z = (end / length).tolist()
     angles = [0.0, float(elementary.arctan2(math.hypot(x, y), z)), float(elementary.arctan2(y, x))]
     visual = ET.SubElement(link, 'visual')
@@ -179,7 +180,7 @@ def add_rod(link: ET.Element, end: Array, radius: float) -> None:
 
 
 def roll_pitch_yaw(rotation: ArrayLike) -> Array:
-    """Angles (3,) of R = Rz(yaw) Ry(pitch) Rx(roll), exact also where pitch is a right angle."""
+    """Angles (3,) of R = Rz(yaw) Ry(pitch) Rx(roll), exact even if pitch is a right angle."""
     r = np.asarray(rotation, dtype=np.float64)
     yaw = float(elementary.arctan2(r[1, 0], r[0, 0]))
     s, c = float(elementary.sin(yaw)), float(elementary.cos(yaw))
@@ -189,6 +190,6 @@ def roll_pitch_yaw(rotation: ArrayLike) -> Array:
 
 
 def xml_numbers(values: Iterable[float]) -> str:
-    """Numbers as the value of an attribute, without a loss."""
-    # -0.0 would be another text for the same number.
+    """Numbers as the value of an XML attribute, without loss of precision."""
+    # Adding 0.0 turns -0.0 into 0.0, so that equal numbers have equal text.
     return ' '.join(repr(float(value) + 0.0) for value in values)

@@ -195,7 +195,7 @@ def test_landmarks_are_keypoints(networks):
 
 
 @pytest.mark.parametrize(
-    ('stamp', 'width', 'anew'),
+    ('stamp', 'width', 'fresh'),
     [
         (3 * INTERVAL, 320, False),
         (2 * INTERVAL, 320, True),
@@ -205,13 +205,13 @@ def test_landmarks_are_keypoints(networks):
         (3 * INTERVAL, 300, True),
     ],
 )
-def test_what_begins_a_new_sequence(networks, stamp, width, anew):
+def test_what_begins_a_new_sequence(networks, stamp, width, fresh):
     detector = BlazePose()
     for each in (INTERVAL, 2 * INTERVAL):
         detector.detect(IMAGE, each)
     networks.asked.clear()
     detector.detect(IMAGE[:, :width], stamp)
-    assert networks.asked == ['person'] * anew + ['landmarks']
+    assert networks.asked == ['person'] * fresh + ['landmarks']
 
 
 # ---- MediaPipe Pose itself ----

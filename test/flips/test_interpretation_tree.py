@@ -275,7 +275,7 @@ def test_straight_limbs_keep_their_free_angle(small):
     assert straight.sum() >= 1
     assert np.allclose(leaves[straight, twist], 0.4)
     assert np.linalg.norm(bend[straight], axis=1).max() < 0.06  # the lengths differ by 5.5 cm
-    # Solved anew, and not only copied from the pose.
+    # Solved again, and not only copied from the pose.
     hung, _ = rehang_chain(small, pose[None], pose[None], 'left_arm', slack=1e-9)
     straight = np.abs(hung[:, names.index('left_elbow')]) < 1e-9
     assert straight.sum() >= 1

@@ -168,7 +168,7 @@ def test_who_stops_has_no_more_turns_and_the_others_go_on(busy):
     busy.until(('one', 1), ('other', 1))
     busy.go()
     assert other.stop(PATIENCE)
-    # The thread has ended; it begins again for whoever comes.
+    # The thread has ended; it begins again for the next message.
     again = busy.serve('again', 0)
     send(again, 1)
     busy.until(('one', 1), ('other', 1), ('again', 1))

@@ -195,7 +195,7 @@ def test_one_warning_for_each_kind_and_the_node_lives(running, small_camera, stu
     wanted = (
         'camera_info on /camera_info has k[0] = 0: uncalibrated; calibrate the camera',
         'wanted stamps that increase',
-        'with reset_on_time_jump the track would start anew',
+        'with reset_on_time_jump the track would start again',
         "encoding 'yuv9' is not known",
         'has 32x24 pixels, wanted the 64x48',
         'keypoint head lies at (nan',

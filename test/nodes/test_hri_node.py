@@ -136,7 +136,7 @@ def test_a_person_is_subscribed_to_once(without_hri, world_of, monkeypatch):
     one = world_of(without_hri.HriNode, 'hri_node', inputs, publish_cropped=False).start()
     first = one.other.create_publisher(PoseMixtureMessage, TOPIC, 100)
     one.spin_until(first.get_subscription_count, 'a subscription')
-    # Whoever comes later is found by a later search, which finds the first person again.
+    # A later person is found by a later search, which finds the first person again.
     later = one.other.create_publisher(PoseMixtureMessage, TOPIC.replace('p1', 'p2'), 100)
     one.spin_until(later.get_subscription_count, 'a subscription')
     assert one.other.count_subscribers(TOPIC) == 1

@@ -86,7 +86,7 @@ def test_missing_transforms_do_not_stop_the_track(session, stub_tracker, small_c
     assert warnings == [
         f"no transform from gravity_frame 'world' to 'lens' at the image of "
         f"{small_camera.stamp(0)} ns: there is no frame 'world'; there are: base, map; the track "
-        'goes on with what was known of gravity'
+        'continues with what was known of gravity'
     ]
     assert one.state.faults == {'no transform': 6}
     (tracker,) = stub_tracker.made

@@ -297,7 +297,7 @@ def test_what_can_not_be_used_is_told(session, outputs, people, small_camera):
     (fault,) = one.take(P1, people(1)).faults
     assert 'wanted stamps that increase' in fault
     (fault,) = one.take(P1, people(0)).faults
-    assert 'with reset_on_time_jump every body would start anew' in fault
+    assert 'with reset_on_time_jump every body would start again' in fault
     broken = people(2)
     broken.joint_names = [f'x_{name}' for name in broken.joint_names]
     (fault,) = one.take(P1, broken).faults

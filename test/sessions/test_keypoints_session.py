@@ -103,7 +103,7 @@ def test_what_goes_wrong_is_told(session, outputs, somebody):
     (fault,) = one.take(IMAGE, somebody.image(5)).faults
     assert 'wanted stamps that increase' in fault
     (fault,) = one.take(IMAGE, somebody.image(4)).faults
-    assert 'with reset_on_time_jump the sequence would start anew' in fault
+    assert 'with reset_on_time_jump the sequence would start again' in fault
     bad = somebody.image(6)
     bad.encoding = 'morse'
     assert 'morse' in one.take(IMAGE, bad).faults[0]
@@ -116,7 +116,7 @@ def test_time_that_jumps_back(session, outputs, somebody):
     one.take(IMAGE, somebody.image(5))
     assert one.take(IMAGE, somebody.image(1)).published == ()
     handled = one.take(IMAGE, somebody.image(2))
-    assert 'the sequence starts anew' in handled.warnings[0]
+    assert 'the sequence starts again' in handled.warnings[0]
     assert len(handled.published) == 4
 
 

@@ -1,4 +1,4 @@
-"""The smoother goes on with the chain of the filter's modes, which its messages carry."""
+"""The smoother continues the chain of the filter's modes, which its messages carry."""
 
 import itertools
 from dataclasses import replace

@@ -493,7 +493,7 @@ def test_time_that_stands_still_or_jumps_back_is_skipped(session, outputs, likel
     handled = [one.take(MIXTURE, likelihoods.message(index)) for index in (1, 1, 0, 2)]
     assert [len(h.faults) for h in handled] == [0, 1, 1, 0]
     assert 'wanted stamps that increase' in handled[1].warnings[0]
-    assert 'with reset_on_time_jump the window would start anew' in handled[2].warnings[0]
+    assert 'with reset_on_time_jump the window would start again' in handled[2].warnings[0]
     one.finish()
     assert smoothed(outputs) == [likelihoods.stamp(1), likelihoods.stamp(2)]
 

@@ -112,7 +112,7 @@ def test_a_clock_that_went_back_loses_no_image(
     assert tracked(outputs)[5:] == [small_camera.stamp(index) for index in range(10)]
     assert len(stub_tracker.made) == 2
     assert one.state.time_jump.startswith('the clock went back by 600 s: image of ')
-    assert one.state.time_jump.endswith('the track starts anew')
+    assert one.state.time_jump.endswith('the track starts again')
 
 
 def test_inputs_of_the_images_that_were_put_aside_count(

@@ -83,7 +83,7 @@ def test_a_moved_camera_is_told_once(one, small_camera, stub_tracker):
     assert [len(texts) for texts in handled] == [0, 0, 1, 0, 0, 1]
     assert handled[2][0].startswith(
         f'{CAMERA_MOVED}: at the image of {small_camera.stamp(3)} ns the scene is 12 px away; fix '
-        'the camera, take background_file anew'
+        'the camera, take background_file again'
     )
     assert 'the scene is elsewhere' in handled[5][0]
     assert one.state.trouble() == CAMERA_MOVED

@@ -200,7 +200,7 @@ def test_time_that_jumps_back_starts_the_track_anew(session, outputs, small_came
     assert outputs[:half] == outputs[half:]
     assert [output.topic for output in outputs].count('body') == 2
     assert one.state.faults == {'time jumps back': 1}
-    assert 'the track starts anew' in one.state.last_fault
+    assert 'the track starts again' in one.state.last_fault
 
 
 def test_images_that_wait_are_tracked_before_time_jumps(session, outputs, small_camera):
@@ -225,7 +225,7 @@ def test_new_calibration_starts_the_track_anew(session, outputs, small_camera, s
     assert one.take(CAMERA_INFO, small_camera.info(1)).warnings == ()
     other = replace(small_camera.camera, fx=70.0)
     handled = one.take(CAMERA_INFO, small_camera.info(1, other))
-    assert handled.warnings == ('camera_info changes: the track starts anew',)
+    assert handled.warnings == ('camera_info changes: the track starts again',)
     one.take(IMAGE, small_camera.image(1))
     assert [tracker.camera for tracker in stub_tracker.made] == [small_camera.camera, other]
     assert len(tracked(outputs)) == 2
@@ -776,7 +776,7 @@ def test_a_camera_that_stops_makes_the_space_grow(session, outputs, small_camera
     after = keep_out_of(read(capsules))
     assert (after.state, after.unseen) == (KeepOutState.STALE, 0.2)
     assert (after.radii - last.radii).tolist() == pytest.approx([1.3] * len(last.radii))
-    # It is told by whoever watches, and not as the answer to an image.
+    # The watcher reports it; it is no answer to an image.
     assert len(kept_out(outputs)) == 1
 
 

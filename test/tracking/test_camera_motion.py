@@ -142,7 +142,7 @@ def test_feet_rest_before_a_moving_camera(body):
 
 
 def test_ways_to_face_are_carried(body):
-    """Who turns the back to the camera is seen anew; the evidence so far goes on as it was."""
+    """Who turns the back to the camera is seen again; the evidence so far is unchanged."""
     poses = np.tile(body.prior_mean, (3, 1))
     poses[:, 2] = 4.0
     heading = body.dof_names.index('root_z')

@@ -37,7 +37,7 @@ def descendants(ancestors: list[int], jumped: np.ndarray) -> Hypotheses:
         ([1, 1, 0], jumps('x.', '..', '..'), [4, 2, 1]),
         # Where all have jumped with a limb, the heaviest goes on.
         ([1, 1, 0], jumps('x.', '.x', '..'), [2, 4, 1]),
-        # What was placed anew comes from nothing.
+        # Modes that were placed again have no ancestor.
         ([1, 2, 0], jumps('xx', '..', '.x'), [4, 3, 1]),
     ],
 )

@@ -384,7 +384,7 @@ def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion
     assert max(errors[found:]) < 0.065
     # The place too, not only the posture.
     assert np.abs(posterior.means[:, :3] - other[:3]).max(1).min() < 0.25
-    # Modes that are placed anew have no history, and the point estimate does not travel to them.
+    # Modes that are placed again have no history, and the point estimate does not travel to them.
     # One image tells the depth to about a tenth.
     assert begins == [i in (0, found) for i in range(len(begins))]
     assert np.abs(places[found][:2] - other[:2]).max() < 0.15
@@ -443,7 +443,7 @@ def test_nothing_becomes_certain_while_a_lost_track_is_sought(
     other, tracker = jumped(motion), started()
     for i in range(LOST_WITHIN + 20):
         seen = keypoints_of(human32, motion[i] if i < 3 else other, 1.0, i)
-        # Starts anew in each image, at a place where nobody is.
+        # Starts again in each image, at a place where nobody is.
         prediction = (
             predicted(human32, motion[0]) if tracker.estimate.status is Status.LOST else None
         )

@@ -1,8 +1,8 @@
 """import-video: writes a video, its camera and the output of a detector into a bag for replay.
 
-The bag has the topics `/image/compressed` and `/camera_info`, and as far as they are known
-`/keypoints`, `/keypoints_3d` and `/mask`, or `/detections` of several people, with the stamp of the
-frame that they belong to.
+The bag has the topics `/image/compressed` and `/camera_info` and, if known, `/keypoints`,
+`/keypoints_3d` and `/mask`, or `/detections` of several people. Each message has the stamp of its
+frame.
 """
 
 from __future__ import annotations
@@ -89,8 +89,8 @@ class Imported:
     """Counts of the images and keypoints that were written.
 
     Attributes:
-        with_keypoints: number of images in which keypoints were seen; None: none were given.
-        with_masks: number of images with a mask; None: none were given.
+        with_keypoints: number of images with keypoints; None if no keypoints were given.
+        with_masks: number of images with a mask; None if no masks were given.
     """
 
     images: int = 0
@@ -104,7 +104,7 @@ class Imported:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; 0: the bag is there, 1: bad input, which one line on stderr explains."""
+    """Runs the command; returns 0 when done, 1 for bad input (one line on stderr explains it)."""
     return run_command(_parser(), _import, argv, whole_or_nothing=True)
 
 
@@ -214,7 +214,7 @@ def add_video_arguments(parser: CommandParser, *, camera_required: bool = True) 
 
 
 def add_keypoint_arguments(parser: argparse._ActionsContainer) -> None:
-    """Adds the arguments that say how keypoints are read."""
+    """Adds the arguments that select how keypoints are read."""
     parser.add_argument(
         '--person',
         type=person_choice,
@@ -310,7 +310,7 @@ def import_video(options: argparse.Namespace, tell: Tell) -> Imported:
 
 
 def _expected(source: FrameSource, selection: Selection) -> int | None:
-    """Number of frames that will be imported; None if that is unknown before they are read."""
+    """Number of frames to import; None if it is unknown before they are read."""
     if not source.claimed or selection.start > 0 or math.isfinite(selection.end):
         return None
     return -(-source.claimed // selection.every)
@@ -326,7 +326,7 @@ def _seer(
     masks: Masks | None,
     tell: Tell,
 ) -> Seer:
-    """The function that gives keypoints and mask of a frame with a stamp."""
+    """Returns a function that finds the keypoints and the mask of a frame with a stamp."""
     chosen: dict[int, Keypoints] | None = None
     reading = ClipReading(options.person, options.scheme, options.keypoints_size, options.mirror)
     detector = None
@@ -356,13 +356,13 @@ def _seer(
 
 
 def _detected(detector: Detector, frame: Frame, stamp_ns: int) -> Keypoints | None:
-    """The keypoints of a frame, which the detector sees with square pixels."""
+    """The keypoints of a frame; the detector gets the frame with square pixels."""
     found = detector.detect(_with_square_pixels(frame), stamp_ns)
     return None if found is None else _in_frame(frame, found)
 
 
 def _people_in(detector: PeopleDetector, frame: Frame, stamp_ns: int) -> list[SeenPerson]:
-    """The people in a frame, whom the detector sees with square pixels."""
+    """The people in a frame; the detector gets the frame with square pixels."""
     return [
         one._replace(keypoints=_in_frame(frame, one.keypoints), corners=one.corners * _scale(frame))
         for one in detector.detect(_with_square_pixels(frame), stamp_ns)
@@ -370,7 +370,7 @@ def _people_in(detector: PeopleDetector, frame: Frame, stamp_ns: int) -> list[Se
 
 
 def _scale(frame: Frame) -> Array:
-    """Widths and heights (2,) in a frame over those in its image with square pixels."""
+    """Ratio (2,) of widths and heights in a frame to those in its image with square pixels."""
     width = frame.image.shape[1]
     return np.array([width / round(width * frame.aspect), 1.0])
 
@@ -384,7 +384,7 @@ def _with_square_pixels(frame: Frame) -> Image:
 
 
 def _in_frame(frame: Frame, found: Keypoints) -> Keypoints:
-    """Keypoints of the image with square pixels, in those of the frame."""
+    """Converts keypoints from the image with square pixels to pixels of the frame."""
     if frame.aspect == 1.0:
         return found
     scale = _scale(frame)
@@ -401,7 +401,7 @@ def _in_pixels_of(frame: Frame, mask: Mask) -> Mask:
 def _same_size(
     source: FrameSource, selection: Selection, mirror: bool
 ) -> Generator[Frame, None, None]:
-    """The frames, of mirror images if they are; one camera_info is for images of one size."""
+    """Yields the frames, mirrored on request; they share one camera_info, hence one size."""
     size: tuple[int, ...] | None = None
     for frame in source.frames(selection):
         if size is not None and frame.image.shape != size:
@@ -422,7 +422,7 @@ def camera_of(
     tell: Tell,
     aspect: float = 1.0,
 ) -> Camera:
-    """The camera that options describe, with images of a size."""
+    """The camera that the options describe, for images of a size."""
     if options.camera is not None:
         return read_camera(options.camera, size, tell)
     return camera_of_view(size, options.fov, options.vertical_fov, aspect)
@@ -436,9 +436,9 @@ def _write(
     lifts: bool,
     tell: Tell,
 ) -> Imported:
-    """Writes frame after frame; one is in memory at a time.
+    """Writes the frames one by one, with only one in memory.
 
-    With `lifts` every image has a message with positions, maybe of none.
+    With `lifts` every image gets a message with 3D positions, which may be empty.
     """
     messages = RosbagsMessages()
     result, camera = Imported(), None
@@ -483,9 +483,9 @@ def _check_ends(
     masks: Masks | None,
     tell: Tell,
 ) -> None:
-    """Whether frames, keypoints and masks are equally many, as far as the frames were read.
+    """Checks that the numbers of frames, keypoints and masks agree, if all frames were read.
 
-    Those of frames that a truncated file has lost are left out.
+    Keypoints and masks of frames that a truncated file has lost are not counted.
     """
     if not source.ended:
         return
@@ -515,7 +515,7 @@ def _check_ends(
 def _check_keypoints(
     options: argparse.Namespace, result: Imported, found: FoundPersons, tell: Tell
 ) -> None:
-    """Raises ValueError where keypoints are not those of the images."""
+    """Checks that imported images have keypoints; raises ValueError or notifies the user."""
     if not result.with_keypoints and any(found.persons()):
         text = (
             f'{options.keypoints}: none of the {result.images} imported frames has keypoints of '

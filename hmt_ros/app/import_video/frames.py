@@ -26,13 +26,13 @@ from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.images import decode_picture, decoded
 
 IMAGE_SUFFIXES = ('.jpg', '.jpeg', '.png', '.bmp', '.tif', '.tiff', '.webp', '.ppm', '.pgm')
-LARGEST_IMAGE_FILE = 2**28  # bytes
-MOST = 1e9  # frames; a head that announces more is damaged
-FASTEST = 1000.0  # frames per second; a container that claims more is damaged
-_EXIF_WITHIN = 2**16  # bytes at the beginning of a JPEG
-_HALF = 127  # grey levels, of masks
-_SQUAREST, _THINNEST = 0.99, 0.1  # sides of pixels, over the longer ones
-# Ubuntu 24.04 ships OpenCV 4.6, which tells the turn of a video in the wrong direction.
+LARGEST_IMAGE_FILE = 2**28  # maximum size, bytes
+MOST = 1e9  # maximum number of frames; a larger number in the header is a sign of damage
+FASTEST = 1000.0  # maximum frames per second; a higher rate in the container is a sign of damage
+_EXIF_WITHIN = 2**16  # bytes from the start of a JPEG that are searched for Exif data
+_HALF = 127  # threshold of masks, grey levels
+_SQUAREST, _THINNEST = 0.99, 0.1  # limits of the ratio of the shorter to the longer side of a pixel
+# OpenCV 4.6, which Ubuntu 24.04 ships, reports the rotation of a video with the wrong sign.
 _TURNS_BACKWARDS = cv2.__version__.startswith('4.6.')
 
 
@@ -41,11 +41,11 @@ class Frame:
     """A frame of a source.
 
     Attributes:
-        number: in the source, from 0.
-        time_ns: since the first frame of the source.
-        name: of its file; '' in a video file.
+        number: number of the frame in the source, from 0.
+        time_ns: time since the first frame of the source, ns.
+        name: name of its file; '' in a video file.
         image: (H, W, 3) BGR, upright.
-        jpeg: the file that it was read from, if that is a JPEG with the same content; else None.
+        jpeg: content of its file if that is a JPEG of the same upright image; else None.
         aspect: width of a pixel over its height.
     """
 
@@ -63,7 +63,7 @@ class Selection:
 
     Attributes:
         start, end: times since the first frame of the source, s; the end is not included.
-        every: take each `every`-th frame from the first wanted on.
+        every: step between selected frames, counted from the first at or after `start`.
     """
 
     start: float = 0.0
@@ -75,7 +75,7 @@ class Selection:
             raise ValueError(f'--start {self.start:g} is not before --end {self.end:g}')
 
     def wanted(self, times_ns: Iterator[int]) -> Iterator[tuple[int, int, bool]]:
-        """Number and time of frames up to the end, and whether each is wanted."""
+        """Yields number and time of each frame before the end, and whether it is wanted."""
         first = None
         for number, time_ns in enumerate(times_ns):
             if time_ns >= self.end * SECOND_NS:
@@ -86,18 +86,18 @@ class Selection:
 
 
 class FrameSource:
-    """Frames of a file or a folder; one of neither kind has none, and numbers those of others.
+    """Frames of a file or a folder; the base class has no frames and only numbers labels.
 
     Args:
-        names: of the files of its frames in their order; empty for a video file.
+        names: names of the files of the frames in order; empty for a video file.
         first_number: number of the first frame in labels.
 
     Attributes:
-        claimed: number of frames that the source announces; 0: it does not tell.
-        count: number of frames that were passed so far, wanted or not.
-        ended: whether the last frame was passed.
-        notes: lines on how frames are shown.
-        rate: frames per second; None: not known, or not the same throughout.
+        claimed: number of frames according to the header; 0 if unknown.
+        count: number of frames read so far, wanted or not.
+        ended: whether the last frame was read.
+        notes: lines for the user on mirrored frames and pixel shapes.
+        rate: frames per second; None if unknown.
     """
 
     rate: float | None = None
@@ -114,7 +114,7 @@ class FrameSource:
         self._by_name |= {x: i for i, x in enumerate(names)}
 
     def frames(self, selection: Selection) -> Iterator[Frame]:
-        """The frames that are wanted; once only.
+        """Yields the selected frames; can be called only once.
 
         Raises:
             ValueError: a frame can not be read.
@@ -122,14 +122,14 @@ class FrameSource:
         return iter(())
 
     def number_of(self, label: str | int) -> int:
-        """Number, from 0, of the frame that a label means.
+        """Number, from 0, of the frame that a label refers to.
 
         Args:
             label: name of the frame's file, with or without suffix; or a number or another name,
-                whose last number counts frames from `first_number` on, as walk_000012 does.
+                whose last number counts frames from `first_number`, as in walk_000012.
 
         Raises:
-            ValueError: it means no frame.
+            ValueError: the label refers to no frame.
         """
         name = Path(str(label))
         for known in (name.name, name.stem):
@@ -150,10 +150,10 @@ def open_source(path: Path, fps: float | None, first_number: int = 0) -> FrameSo
     """Opens a video file or a folder of images.
 
     Args:
-        fps: frames per second; None: a video file has its own times.
+        fps: frames per second; None: the times in the video file.
 
     Raises:
-        ValueError: it is not there, or has no frames.
+        ValueError: the file or folder is missing or has no frames.
     """
     if path.is_dir():
         return ImageFolder(path, fps, first_number)
@@ -165,7 +165,7 @@ def open_source(path: Path, fps: float | None, first_number: int = 0) -> FrameSo
 
 
 class VideoFile(FrameSource):
-    """A video file. Phones write how they were held: frames are turned and mirrored as players do.
+    """A video file; frames are rotated and mirrored according to its metadata, as in players.
 
     Args:
         fps: frames per second; None: the times in the file.
@@ -174,7 +174,7 @@ class VideoFile(FrameSource):
     def __init__(self, path: Path, fps: float | None, first_number: int = 0) -> None:
         super().__init__(path, first_number=first_number)
         self._capture = open_video(path)
-        # Versions of OpenCV differ in whether they turn frames, and in which direction.
+        # Versions of OpenCV differ in whether and in which direction they rotate frames.
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         angle = round(self._capture.get(cv2.CAP_PROP_ORIENTATION_META))
         turned = TURNED.get((-angle if _TURNS_BACKWARDS else angle) % 360, STORED)
@@ -216,7 +216,7 @@ class VideoFile(FrameSource):
             self._capture.release()
 
     def _times(self) -> Iterator[int]:
-        """Times of the frames, each of which is the present frame until the next is asked for."""
+        """Yields the time of each frame, which stays current until the next time is requested."""
         fps = self._capture.get(cv2.CAP_PROP_FPS)
         first, last = 0.0, -1
         while self._capture.grab():
@@ -227,7 +227,7 @@ class VideoFile(FrameSource):
             if self._fps is not None:
                 time_ns = round(self.count * SECOND_NS / self._fps)
             elif time_ns <= last:
-                # Containers without times give zero, damaged ones jump back.
+                # Times are 0 in containers without times, and may decrease in damaged ones.
                 if not 0 < fps <= FASTEST:
                     raise ValueError(
                         f'{self.path} has neither times nor a rate of frames; give --fps'
@@ -243,7 +243,7 @@ class ImageFolder(FrameSource):
     """A folder of images, in the order of the numbers in their names.
 
     Args:
-        fps: images per second; None: only their order is known.
+        fps: images per second; None if unknown, then only single images can be read.
     """
 
     def __init__(self, path: Path, fps: float | None, first_number: int = 0) -> None:
@@ -267,10 +267,10 @@ class ImageFolder(FrameSource):
         self.ended = self.count == len(self._files)
 
     def frame(self, number: int, time_ns: int = 0) -> Frame:
-        """An image of the folder.
+        """Reads an image of the folder.
 
         Raises:
-            ValueError: it can not be read.
+            ValueError: the image can not be read.
         """
         file = self._files[number]
         try:
@@ -282,7 +282,7 @@ class ImageFolder(FrameSource):
 
 
 def _upright(content: bytes) -> tuple[Image, bytes | None]:
-    """The image in a file, upright, and the file if it is a JPEG that needs no turning."""
+    """The upright image in a file, and the file content if it is a JPEG that needs no rotation."""
     if content.startswith(b'\xff\xd8\xff'):
         as_stored = decode_picture(content, 'jpeg')
         if b'Exif\0' not in content[:_EXIF_WITHIN]:
@@ -295,7 +295,7 @@ def _upright(content: bytes) -> tuple[Image, bytes | None]:
 
 
 def natural_order(name: str) -> list[tuple[int, str]]:
-    """Key that sorts names with numbers as people count: frame_9 before frame_10."""
+    """Sort key of names by their numbers: frame_9 before frame_10."""
     parts = re.findall(r'\d+|\D+', name)
     return [(int(x), '') if x.isdecimal() else (-1, x) for x in parts]
 
@@ -303,11 +303,11 @@ def natural_order(name: str) -> list[tuple[int, str]]:
 class Masks:
     """Masks that belong to the frames of a source.
 
-    In a folder a mask belongs to the frame that its file name means (`FrameSource.number_of`); in a
-    video, to the frame of the same number.
+    In a folder the file name of a mask gives its frame (`FrameSource.number_of`); in a video a mask
+    belongs to the frame of the same number.
 
     Raises:
-        ValueError: there are none.
+        ValueError: there are no masks, or file names give no frame or the same frame.
     """
 
     def __init__(self, path: Path, source: FrameSource) -> None:
@@ -333,14 +333,14 @@ class Masks:
 
     @property
     def last(self) -> int:
-        """Number of the last frame that has a mask; -1: none has, as far as one knows yet."""
+        """Number of the last frame that has a mask; -1 if there is none, or in a video."""
         return max(self._files, default=-1)
 
     def of(self, frame: Frame) -> Mask | None:
-        """The mask (H, W) of a frame, whose numbers must rise; None: there is none.
+        """The mask (H, W) of a frame, or None; call it with increasing frame numbers.
 
         Raises:
-            ValueError: it has another size than the frame, or does not tell person from scene.
+            ValueError: its size differs from that of the frame, or it covers the whole image.
         """
         found = self._found(frame.number)
         if found is None:
@@ -366,9 +366,9 @@ class Masks:
 
 
 def mask_in(image: Image) -> Mask:
-    """(H, W) where a picture (H, W, 3) shows the person.
+    """Mask (H, W) of the person in a picture (H, W, 3) of a mask.
 
-    The brightest channel is above 127 there, or above 0 in a picture of zeros and ones.
+    The person is where the brightest channel exceeds 127, or 0 in a picture of zeros and ones.
     """
     brightest = image.max(2)
     result: Mask = brightest > (_HALF if brightest.max() > 1 else 0)

@@ -1,6 +1,6 @@
-"""The lens as a video file tells of it: phones of Apple write the focal length that they use.
+"""Reads the focal length from the metadata of a video file, where Apple phones write it.
 
-The key stands in the metadata of the movie or of its track (QuickTime File Format, Metadata): a box
+The key is in the metadata of the movie or of its track (QuickTime File Format, Metadata): a box
 `keys` with names, and a box `ilst` with values by the number of their name.
 """
 
@@ -15,17 +15,17 @@ from pathlib import Path
 from msg_tools.files.mp4_boxes import Data, boxes, boxes_at, mapped
 
 KEY = b'com.apple.quicktime.camera.focal_length.35mm_equivalent'
-# Width of a picture on 35 mm film, mm; focal lengths that lenses have, in its terms, mm.
+# Width of a picture on 35 mm film, and range of plausible 35 mm equivalent focal lengths, mm.
 FILM, FOCAL_LENGTHS = 36.0, (6.0, 1200.0)
-# Relative standard deviation of a focal length that is told so: videos are cropped to be steady,
-# and to be wide, which the number does not say.
+# Relative standard deviation of a focal length from metadata, which do not include the cropping for
+# stabilisation and aspect ratio.
 TOLD_SIGMA = 0.1
-# Types of values that are not whole numbers.
+# Type codes of values that are not integers.
 _TEXT, _FLOATS = 1, {23: '>f', 24: '>d'}
 
 
 def told_fov(path: Path) -> float | None:
-    """The field of view, degrees, along the longer side of the images; None: it is not told."""
+    """The field of view along the longer side of the images, degrees; None if unknown."""
     with mapped(path) as data:
         try:
             focal = next(_focal_lengths(data), math.nan)
@@ -36,11 +36,11 @@ def told_fov(path: Path) -> float | None:
 
 
 def _focal_lengths(data: Data) -> Iterator[float]:
-    """Values of the key in a file."""
+    """Yields the values of the key in a file."""
     whole = 0, len(data)
     of_track = boxes_at(data, *whole, b'moov', b'trak', b'meta')
     for first, last in chain(boxes_at(data, *whole, b'moov', b'meta'), of_track):
-        # In MP4 files a version stands before the boxes.
+        # In MP4 files a version precedes the boxes.
         first += 0 if data[first + 4 : first + 8] == b'hdlr' else 4
         inner = {name: (a, b) for name, a, b in boxes(data, first, last)}
         first, last = inner.get(b'keys', (0, 0))
@@ -52,7 +52,7 @@ def _focal_lengths(data: Data) -> Iterator[float]:
 
 
 def _number(value: bytes) -> float:
-    """The number in a value: its type, its language, and the number itself."""
+    """The number in a value, which consists of type, language and number."""
     kind, content = int.from_bytes(value[:4], 'big'), value[8:24]
     if kind in _FLOATS:
         return float(struct.unpack(_FLOATS[kind], content)[0])

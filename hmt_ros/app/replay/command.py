@@ -1,10 +1,10 @@
-"""replay: tracks and smooths the person in a bag, offline or through live nodes, into a new bag.
+"""replay: tracks the person in a bag, offline or through live nodes, and writes a new bag.
 
 Without a subject file the track starts from the keypoints in the bag, or from the prediction of a
 trained model.
 
-Both ways hand the same messages to the same objects in the same order, and write the results in the
-order in which they come: the bags are the same, byte for byte. `hmt_ros.sessions.track_messages`,
+Both ways pass the same messages to the same objects in the same order, and write the results in
+their order: the bags are equal, byte for byte. `hmt_ros.sessions.track_messages`,
 `smoothed_messages` and `bme_session` list the topics of a new bag.
 """
 
@@ -58,7 +58,7 @@ exit code: 0 done, 1 bad input (one line on stderr explains it) or some of sever
 line for each), 130 interrupted
 """
 
-# What the topics of options are of, and where it is looked for without them.
+# Help texts of the options of topics: their contents and default names.
 _TOPICS = {
     'image': 'the images (default: image/compressed, else image, else the only topic of images)',
     'camera-info': 'the calibration (default: camera_info beside the images, else the only one)',
@@ -69,7 +69,7 @@ _TOPICS = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; 0: the bag is there, 1: bad input, which one line on stderr explains."""
+    """Runs the command; returns 0 when done, 1 for bad input (one line on stderr explains it)."""
     return run_command(_parser(), _replay, argv, whole_or_nothing=True)
 
 
@@ -189,7 +189,7 @@ def _parser() -> CommandParser:
 
 
 def _namespace(text: str) -> str:
-    """Reads a namespace of ROS; '' for the root."""
+    """Reads a ROS namespace; '' is the root."""
     name = text.strip('/')
     if name and not re.fullmatch(r'[A-Za-z_]\w*(/[A-Za-z_]\w*)*', name, re.ASCII):
         raise argparse.ArgumentTypeError(

@@ -1,4 +1,4 @@
-"""The input of the filter in a bag: images, calibration, inputs beside them, transforms."""
+"""The input of the filter in a bag: images, calibration, additional inputs, transforms."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
 CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
 
-# Names of topics that are preferred to all others.
+# Preferred names of the topic of the images.
 _USUAL = ('image/compressed', 'image')
 GROUND_TRUTH = 'ground_truth'
-# Rows of the table of inputs that a bag may have: predictions are made anew.
+# Inputs read from the bag; replay recomputes predictions.
 RECORDED = (*(row for row in INPUTS if row is not PREDICTION_INPUT), DETECTIONS_INPUT)
-# Frames with z up that stand still [REP 105]; messages that are searched for a way to one.
+# Fixed frames with z up [REP 105], and maximum number of messages that are searched for one.
 UPRIGHT_FRAMES = ('odom', 'map', 'world')
 _SEARCHED = 2000
-# End of the name of the topic of the filter's drawings.
+# Suffix of the topic of the filter's drawings.
 OVERLAY = 'overlay/compressed'
 
 
@@ -46,15 +46,15 @@ class RecordedInput:
     """The topics of a bag that a replay reads.
 
     Attributes:
-        given: topics of the inputs that come with the images, by source.
-        transforms: topics of transforms by source, those that the bag has of `TRANSFORMS`; None if
+        given: topics of the additional inputs, by source.
+        transforms: topics of the transforms in the bag by source, keys in `TRANSFORMS`; None if
             transforms are not used.
-        upright_frame: one of `UPRIGHT_FRAMES` that transforms lead to from the camera; empty: they
-            lead to none.
+        upright_frame: one of `UPRIGHT_FRAMES` that is an ancestor of the camera frame; empty if
+            there is none.
         video: whether the images are packets of a video, which `messages` decodes.
-        scaled: size (width, height), px, of images for which `messages` scales the calibration,
-            which is that of another size of the same shape; None: it fits.
-        by_log: whether `messages` replaces stamps by the times at which images were recorded.
+        scaled: size (width, height), px, of the images, to which `messages` scales a calibration
+            of another size with the same aspect ratio; None if the calibration fits.
+        by_log: whether `messages` replaces stamps by the log times of the images.
     """
 
     image: Topic
@@ -79,7 +79,7 @@ class RecordedInput:
         return next((self.given[source] for source in row.types if source in self.given), None)
 
     def messages(self, bag: BagReader) -> Generator[tuple[str, BagMessage], None, None]:
-        """(source, message) by log time; the source is one of the filter or `GROUND_TRUTH`.
+        """Yields (source, message) by log time; the source is one of the filter or `GROUND_TRUTH`.
 
         Raises:
             BagError: the bag is damaged here; the messages before the damage were yielded.
@@ -101,7 +101,7 @@ class RecordedInput:
                 yield sources[stored.topic], stored
 
     def check_stamps(self, bag: BagReader) -> None:
-        """Raises BagError where images have no stamps, and none are made up for them."""
+        """Raises BagError if images have no stamps and log times do not replace them."""
         try:
             first = [x.message for x in islice(bag.messages([self.image.name]), 2)]
         except BagError:
@@ -114,17 +114,17 @@ class RecordedInput:
 
 
 def _scaled(stored: BagMessage, size: tuple[int, int]) -> BagMessage:
-    """A camera_info for images of another size."""
+    """The camera_info, scaled to images of another size."""
     try:
         camera, header = camera_from_info(stored.message, size), stored.message.header
     except ValueError:
-        return stored  # who takes it reports it
+        return stored  # the node that receives it reports the fault
     stamp, frame = time_ns(header.stamp), str(header.frame_id)
     return stored.with_message(camera_info_message(RosbagsMessages(), camera, stamp, frame))
 
 
 def fitted(bag: BagReader, recorded: RecordedInput, tell: Callable[[str], object]) -> RecordedInput:
-    """The same topics, with a calibration that is scaled where images have another size."""
+    """The same topics, with the calibration scaled if the images have another size."""
     messages = bag.messages([recorded.image.name])
     if recorded.video:
         messages = with_pictures(messages, recorded.image.name)
@@ -137,22 +137,23 @@ def fitted(bag: BagReader, recorded: RecordedInput, tell: Callable[[str], object
             return recorded
         camera_from_info(info, (width, height), told.append)
     except (ValueError, StopIteration):
-        return recorded  # the replay itself reports what is wrong
+        return recorded  # the replay itself reports the fault
     tell(f'{bag.path}: {told[-1]}')
     return replace(recorded, scaled=(width, height))
 
 
 def _by_log(messages: Iterator[BagMessage], image: str) -> Iterator[BagMessage]:
-    """Messages with other stamps: an image that at which it was recorded.
+    """Replaces the stamp of each image by its log time.
 
-    Others get that of the newest image that had their stamp, or else that of their own.
+    Any other message gets the log time of the newest image with its old stamp, or else its own.
+    Transforms get their own log times.
     """
     times: dict[int, int] = {}
     for stored in messages:
         try:
             message = stored.message
         except BagError:
-            message = None  # who takes it reports it
+            message = None  # the node that receives it reports the fault
         for each in getattr(message, 'transforms', [message]):
             if (header := getattr(each, 'header', None)) is None:
                 continue
@@ -173,20 +174,20 @@ def recorded_input(
     topics: Mapping[str, str | None] | None = None,
     namespace: str = '',
 ) -> RecordedInput:
-    """Finds the topics.
+    """Finds the topics that a replay reads.
 
-    Images come from `image/compressed`, else from `image`, else from the only topic of images.
-    Calibration comes from `camera_info` beside the images, else from the only topic of its type.
-    Inputs beside the images have the names of the table of inputs, transforms come from `/tf` and
+    Images are on `image/compressed`, else on `image`, else on the only topic of images. The
+    calibration is on `camera_info` beside the images, else on the only topic of its type.
+    Additional inputs have the names in the table of inputs; transforms are on `/tf` and
     `/tf_static`.
 
     Args:
         image_topic, camera_info_topic: names that replace the automatic choice.
-        topics: the same, by the name of the input.
-        namespace: topics in it are preferred to those in the root, '/humans/bodies/p1' for example.
+        topics: topics that replace the automatic choice, by the name of the input.
+        namespace: preferred namespace of the topics, '/humans/bodies/p1' for example.
 
     Raises:
-        BagError: there are no images, no camera_info, or several topics to choose from.
+        BagError: there are no images or no camera_info, or the choice is ambiguous.
     """
     named = partial(_in_namespace, bag, namespace)
     given: dict[str, Topic] = {}
@@ -218,7 +219,7 @@ def recorded_input(
 
 
 def upright_frame(bag: BagReader, recorded: RecordedInput) -> str:
-    """The frame of `UPRIGHT_FRAMES` that is nearest above the camera; empty: there is none."""
+    """The nearest ancestor of the camera frame in `UPRIGHT_FRAMES`; empty if there is none."""
     names = {topic.name for topic in (recorded.transforms or {}).values()}
     if not names:
         return ''
@@ -265,7 +266,7 @@ def _camera_info_topic(bag: BagReader, image: Topic, name: str | None) -> Topic:
     kinds = (CAMERA_INFO_TYPE,)
     if name is not None:
         return bag.find_topic(kinds, name)
-    # /camera/image_raw/compressed has its calibration in /camera/camera_info.
+    # The calibration of /camera/image_raw/compressed is on /camera/camera_info.
     namespace = image.name.strip('/')
     if image.msgtype != IMAGE_TYPE:
         namespace = namespace.removesuffix('/compressed').removesuffix('/foxglove')
@@ -284,13 +285,13 @@ def _camera_info_topic(bag: BagReader, image: Topic, name: str | None) -> Topic:
 def _in_namespace(
     bag: BagReader, namespace: str, name: str, kinds: tuple[str, ...]
 ) -> Topic | None:
-    """The topic with a name in a namespace, else in the root, with messages of one of the types."""
+    """The topic of one of the types with a name in a namespace, else in the root."""
     inside = absolute_name(name, namespace).lstrip('/')
     return _named(bag, inside, kinds) or _named(bag, name, kinds)
 
 
 def _named(bag: BagReader, name: str, kinds: tuple[str, ...]) -> Topic | None:
-    """The topic with a name and with messages of one of the types."""
+    """The topic with a name and one of the types."""
     found = (topic for topic in bag.topics_of(*kinds) if topic.name.lstrip('/') == name)
     return next(found, None)
 
@@ -298,7 +299,7 @@ def _named(bag: BagReader, name: str, kinds: tuple[str, ...]) -> Topic | None:
 def _the_only(
     bag: BagReader, kinds: tuple[str, ...], option: str, besides: tuple[str, ...] = ()
 ) -> Topic:
-    """The only topic of some types, except those of some names and the drawings of the tracker."""
+    """The only topic of some types, except for given names and the drawings of the tracker."""
     found = [
         topic
         for topic in bag.topics_of(*kinds)

@@ -1,9 +1,9 @@
 """Real nodes in processes of their own, fed over DDS in lock step.
 
-Each message is published as it is in the bag; the next one follows when the node has reported on
-`~/handled` how it handled the message and all that it published has arrived. No message is lost and
-none overtakes another, so the result does not depend on the speed of the machine. The nodes run in
-the domain of their player, which nobody else uses.
+Each message is published unchanged. The next message is published after the node has reported on
+`~/handled` how it handled the message, and after all its results have arrived. No message is lost
+or reordered, so the result does not depend on the speed of the machine. The nodes run in the domain
+of their player, which no other process uses.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from hmt_ros.sessions.session import SUBSCRIBERS, PublishedTopic
 from hmt_ros.sessions.transform_buffer import TF_STATIC
 from msg_tools.messages.cdr import canonical, deserialise, serialise
 
-# Long limits, which end a replay that hangs. The end of a node is noticed at once.
+# Long time limits, which end a replay that hangs; a node that ends is detected at once.
 START_SECONDS = 600.0
 MESSAGE_SECONDS = 120.0
 STOP_SECONDS = 20.0
 STALE_SECONDS = 3600.0
-# Sources whose messages late subscribers get, too.
+# Sources whose messages late subscribers also get.
 LATCHED_SOURCES = (TF_STATIC,)
 
 
@@ -42,8 +42,8 @@ class NodeProcess:
     """A process in which nodes run.
 
     Args:
-        player: the participant that its nodes talk to.
-        words: for its command line, before those of ROS.
+        player: the participant that the nodes communicate with.
+        words: arguments of its command line, before those of ROS.
     """
 
     def __init__(
@@ -56,14 +56,14 @@ class NodeProcess:
         opened.callback(self.stop)
 
     def add(self, *options: str) -> None:
-        """Gives options of ROS to the process, before it starts."""
+        """Adds ROS options to the command line; call it before `start`."""
         self._options += options
 
     def start(self) -> None:
         """Starts the process."""
         sources = str(Path(hmt_ros.__file__).resolve().parents[1])
         command = [sys.executable, '-m', self._module, *self._words, '--ros-args', *self._options]
-        # Without status lines the last line of its output is the one that matters.
+        # Without status lines the last line of the output explains a failure.
         command += ['--log-level', 'warn']
         with self._file.open('wb') as output:
             self._process = subprocess.Popen(
@@ -78,21 +78,21 @@ class NodeProcess:
                         [sources, *filter(None, [os.environ.get('PYTHONPATH')])]
                     ),
                     'ROS_LOG_DIR': str(self._player.folder),
-                    # As `hmt_ros.nodes.run_node.OWNER`: a killed replay leaves no nodes.
+                    # See `hmt_ros.nodes.run_node.OWNER`: the nodes of a killed replay end.
                     'HMT_ROS_OWNER': str(os.getpid()),
                 },
-                # The interrupt key is for this process; it stops the node itself.
+                # The interrupt key must reach this process only, which then stops the node.
                 start_new_session=True,
             )
 
     @property
     def popen(self) -> subprocess.Popen[bytes]:
-        """The process itself, once it has started."""
+        """The process, which must have started."""
         assert self._process is not None
         return self._process
 
     def stop(self) -> int | None:
-        """Ends the process as the interrupt key does, and gives its exit code."""
+        """Ends the process as the interrupt key does, and returns its exit code."""
         process = self._process
         if process is None:
             return None
@@ -105,7 +105,7 @@ class NodeProcess:
             return process.wait()
 
     def output(self) -> str:
-        """All that it has written to its console."""
+        """All console output of the process."""
         return self._file.read_text('utf-8', 'replace')
 
     @property
@@ -119,11 +119,11 @@ class LiveNode:
     Args:
         player: the participant that publishes for the node and subscribes to it.
         inputs: topic and type of the messages for the node, by source.
-        sensors: topics with the QoS of sensor data, which may lose messages; here they are
-            reliable.
-        module: module that runs the node; empty: the one in `hmt_ros.nodes` with its name.
-        within: a process of several nodes, which the caller starts; None: one of its own.
-        write: takes topic, stamp and bytes of each message of the node, in its order.
+        sensors: topics with the QoS of sensor data, which may lose messages; they are made
+            reliable here.
+        module: module that runs the node; empty: the module of its name in `hmt_ros.nodes`.
+        within: a process of several nodes, which the caller starts; None: a process of its own.
+        write: called with topic, stamp and bytes of each message of the node, in order.
 
     Raises:
         LiveNodeError: the node does not start.
@@ -156,25 +156,25 @@ class LiveNode:
             self._process.start()
 
     def publish(self, source: str, message: Any) -> None:
-        """Hands a message over."""
+        """Publishes a message for the node."""
         self.publish_bytes(source, serialise(message))
 
     def publish_bytes(self, source: str, data: bytes) -> None:
-        """Hands over bytes, which need not be a message."""
+        """Publishes bytes for the node, which need not be a valid message."""
         if source in self._shared:
             self._own.sent(data)
         self._publishers[source].publish(data)
 
     @property
     def has_answered(self) -> bool:
-        """Whether an answer has arrived, for which `answer` need not wait."""
+        """Whether an answer has arrived, so that `answer` need not wait for it."""
         return bool(self._answers)
 
     def answer(self, source: str, seconds: float | None = None) -> Handled:
-        """Waits until the next message is handled, and writes what the node has published.
+        """Waits until the next message is handled, and writes the results of the node.
 
         Args:
-            seconds: longest time to wait; None: `MESSAGE_SECONDS`.
+            seconds: maximum time to wait; None: `MESSAGE_SECONDS`.
 
         Raises:
             LiveNodeError: the node has ended, or does not answer.
@@ -184,7 +184,7 @@ class LiveNode:
         handled = handled_of(deserialise(answer, HANDLED))
         for topic, stamp in handled.published:
             if topic not in self._arrived:
-                continue  # of a person, whose topics come and go
+                continue  # a topic of one person, which is created and closed during the run
             data = self._next(self._arrived[topic], patience, f'{topic} of {stamp} ns')
             # DDS may pad a message to a multiple of four bytes.
             self._write(topic, stamp, canonical(data, self._topics[topic].msgtype))
@@ -194,7 +194,7 @@ class LiveNode:
         """Deactivates the node, which then finishes its work.
 
         Raises:
-            LiveNodeError: it does not.
+            LiveNodeError: the node can not be deactivated.
         """
         from lifecycle_msgs.msg import Transition
         from lifecycle_msgs.srv import ChangeState
@@ -204,10 +204,10 @@ class LiveNode:
             raise LiveNodeError(f'the {self.title} can not be deactivated: {self._last_words()}')
 
     def call(self, kind: Any, service: str, **fields: Any) -> Any:
-        """The answer of a service of the node, 'change_state' for example.
+        """Calls a service of the node, 'change_state' for example, and returns the answer.
 
         Raises:
-            LiveNodeError: there is no answer.
+            LiveNodeError: the service does not answer.
         """
         client = self._player.node.create_client(kind, f'/{self.name}/{service}')
         try:
@@ -224,7 +224,7 @@ class LiveNode:
         return self._process.popen
 
     def output(self) -> str:
-        """All that the process of the node has written to its console."""
+        """All console output of the process of the node."""
         return self._process.output()
 
     @property
@@ -247,7 +247,7 @@ class LiveNode:
             future = self._state.call_async(self._state_request)
             self._wait(future.done, START_SECONDS, 'the state of the node')
             label = future.result().current_state.label
-        # To a shared topic this side subscribes, too.
+        # The player subscribes to shared topics as well.
         publishers = self._publishers.items()
         self._wait(
             lambda: all(
@@ -262,7 +262,7 @@ class LiveNode:
         """Returns when a number of nodes, including this one, subscribe to some of its inputs.
 
         Raises:
-            LiveNodeError: they do not.
+            LiveNodeError: they do not subscribe in time.
         """
         publishers = [self._publishers[source] for source in sources]
         self._wait(
@@ -278,7 +278,7 @@ class LiveNode:
         are not connected yet.
 
         Raises:
-            LiveNodeError: they are not.
+            LiveNodeError: they are not connected in time.
         """
 
         def connected() -> bool:
@@ -288,11 +288,11 @@ class LiveNode:
         self._wait(connected, START_SECONDS, f'subscribers of {", ".join(topics)}')
 
     def stop(self) -> int | None:
-        """Ends the node as the interrupt key does, and gives its exit code."""
+        """Ends the node as the interrupt key does, and returns its exit code."""
         return self._process.stop()
 
     def stop_well(self) -> None:
-        """Ends the node.
+        """Ends the node, and checks its exit code.
 
         Raises:
             LiveNodeError: its exit code is not 0.
@@ -302,10 +302,10 @@ class LiveNode:
             raise LiveNodeError(f'the {self.title} ended with code {code}: {self._last_words()}')
 
     def _options(self, parameters: Any, sensors: tuple[str, ...]) -> list[str]:
-        """Options of ROS that give the node its parameters and names."""
+        """ROS options with the parameters of the node and the names of its topics."""
         values = {name: yaml_scalar(value) for name, value in values_of(parameters).items()}
         if 'stale_time' in values:
-            # In lock step an image may take as long as it wants.
+            # In lock step the time that an image takes has no limit.
             values['stale_time'] = yaml_scalar(STALE_SECONDS)
         for topic in sensors:
             values[f'qos_overrides.{topic}.subscription.reliability'] = 'reliable'
@@ -320,7 +320,7 @@ class LiveNode:
         return options
 
     def _topic(self, name: str) -> str:
-        """The topic of a name; shared topics that a node publishes on are its own here."""
+        """The absolute topic of a name; absolute topics that the node publishes get its prefix."""
         if not name.startswith('/'):
             return f'/{name}'
         return f'/{self.name}{name}' if name in self._topics else name
@@ -337,7 +337,7 @@ class LiveNode:
             )
             for source, (topic, msgtype) in inputs.items()
         }
-        # Sources whose topic the node publishes on, too, and messages published there by this side.
+        # Sources on topics that the node also publishes, and own messages on these topics.
         self._shared = {source for source, (topic, _) in inputs.items() if topic in self._topics}
         self._own = OwnMessages()
         shared = {inputs[source][0] for source in self._shared}
@@ -386,7 +386,7 @@ class LiveNode:
 
 
 def _into(queue: deque[bytes], own: OwnMessages | None = None) -> Callable[[bytes], None]:
-    """A callback that appends messages of others to a queue; rclpy inspects its signature."""
+    """A callback that queues messages except own ones; rclpy inspects its signature."""
 
     def receive(data: bytes) -> None:
         if own is None or not own.is_own(data):

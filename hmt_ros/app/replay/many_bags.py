@@ -1,8 +1,8 @@
-"""Replay of many bags, one after the other or through Dask; bags that are done are skipped.
+"""Replay of many bags, one after the other or through Dask; complete bags are skipped.
 
 Each new bag `<name>` has `<name>.replay.json` beside it, which records its inputs (sizes and times
 of the input files, all parameters, checksums of the files that they name, the version of this
-package) and whether it is complete. The record is written before and after the replay.
+package) and whether the new bag is complete. The record is written before and after the replay.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from msg_tools.files.error_line import LONGEST_LINE, error_line, one_line
 from msg_tools.files.new_folder import locked, new_file
 from msg_tools.files.plain_json import read_plain_json
 
-# Options that change the new bag, besides the parameters.
+# Options that affect the new bag, besides the parameters.
 _DECIDING = (
     'image_topic',
     'camera_info_topic',
@@ -49,16 +49,16 @@ _DECIDING = (
 
 DONE, BEFORE, FAILED = 'done', 'done before', 'failed'
 
-# The scheduler that uses the cores of this machine.
+# Name of the scheduler that uses the cores of this machine.
 LOCAL = 'local'
-_LARGEST_RECORD = 2**24  # bytes
-_PATIENCE = 10.0  # s, until a scheduler answers
+_LARGEST_RECORD = 2**24  # maximum size, bytes
+_PATIENCE = 10.0  # maximum time until a scheduler answers, s
 
 
 class Job(NamedTuple):
     """The replay of one of many bags: name of the new bag in its folder, paths, options.
 
-    `shows` tells whether the progress of this bag is shown, besides that of all.
+    `shows` is true if the progress of this bag is shown besides the total progress.
     """
 
     name: str
@@ -87,7 +87,7 @@ class Outcome:
 
 
 def is_many(sources: Sequence[Path], scheduler: str | None) -> bool:
-    """Whether the command is about several bags."""
+    """Whether the command replays several bags."""
     if scheduler is not None or len(sources) > 1:
         return True
     path = sources[0]
@@ -104,13 +104,13 @@ def replay_many(
     """Replays all bags.
 
     Args:
-        scheduler: address of a Dask scheduler, or `LOCAL`; None: one bag after the other.
+        scheduler: address of a Dask scheduler, or `LOCAL`; None replays the bags one by one.
 
     Returns:
-        The exit code: 0 all bags are done, 1 some failed, `INTERRUPTED`.
+        The exit code: 0 if all bags are done, 1 if some failed, or `INTERRUPTED`.
 
     Raises:
-        ValueError: nothing can be started.
+        ValueError: no replay can be started.
     """
     if options.live:
         raise ValueError('--live replays one bag at a time; leave it out for several')
@@ -145,7 +145,7 @@ def replay_many(
 
 
 def _by_dask(jobs: Sequence[Job], scheduler: str) -> Iterator[Outcome]:
-    """Outcomes of jobs in the order in which they end."""
+    """Runs jobs through Dask, and yields their outcomes in order of completion."""
     try:
         distributed: Any = importlib.import_module('distributed')
     except ImportError as error:
@@ -172,13 +172,13 @@ def _by_dask(jobs: Sequence[Job], scheduler: str) -> Iterator[Outcome]:
             raise ValueError(f'--scheduler {scheduler}: {error_line(error)}') from error
         job_of = {client.submit(_replay_in_worker, job, pure=False): job for job in jobs}
         for future in distributed.as_completed(job_of):
-            # An error of the future is one of Dask, for example a killed worker.
+            # `replay_job` raises nothing: an error here is from Dask, such as a killed worker.
             fault = future.exception()
             yield future.result() if fault is None else _failed(job_of[future], fault, ())
 
 
 def _replay_in_worker(job: Job) -> Outcome:
-    """`replay_job` on one core: the others have workers of their own."""
+    """Runs `replay_job` on one core; the other cores have their own workers."""
     limit_threads(1)
     cv2.setNumThreads(1)
     _keep_memory()
@@ -186,19 +186,19 @@ def _replay_in_worker(job: Job) -> Outcome:
 
 
 def _keep_memory() -> None:
-    """Has the C library keep the memory of an image for the next one.
+    """Makes the C library keep the memory of an image for the next image.
 
-    Dask starts workers with an environment in which it gives all back at once: more than a quarter
-    of their time the system then fills pages with zeros.
+    In the environment of Dask workers it returns all memory at once, and workers spend more than a
+    quarter of their time on pages that the system fills with zeros.
     """
-    mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)  # glibc has it
+    mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)  # only glibc has it
     if mallopt is not None:
         for parameter, value in (_TRIM_THRESHOLD, _MMAP_THRESHOLD):
             mallopt(parameter, value)
 
 
 def replay_job(job: Job) -> Outcome:
-    """Replays one bag of many, unless it is done."""
+    """Replays one of many bags, unless it is complete."""
     told: list[str] = []
     try:
         kind, text = _replayed_once(job, told.append)
@@ -222,7 +222,7 @@ def _replayed_once(job: Job, tell: Tell) -> tuple[str, str]:
     if known.get('made_from') == made_from:
         if known.get('done') and known.get('files') == _sizes(target):
             return BEFORE, 'done before'
-        # This command has started the bag and did not complete it: its remains are ours.
+        # An earlier run of this command did not complete the bag; its remains may be replaced.
         options = replace(options, overwrite=True)
     elif os.path.lexists(target) and not options.overwrite:
         raise BagError(
@@ -245,7 +245,7 @@ def _replayed_once(job: Job, tell: Tell) -> tuple[str, str]:
     return DONE, str(replayed)
 
 
-# Inputs of a bag
+# Input of a bag
 
 
 def _made_from(job: Job) -> dict[str, Any]:
@@ -265,13 +265,13 @@ def _made_from(job: Job) -> dict[str, Any]:
         'parameters': parameters,
         'options': {name: getattr(options, name) for name in _DECIDING},
     }
-    # With the types that reading it again gives.
+    # Convert to the types that a record has when it is read again.
     result: dict[str, Any] = json.loads(json.dumps(made_from, default=str))
     return result
 
 
 def _without_paths(value: Any) -> Any:
-    """The value with checksums of files in place of their names."""
+    """The value with names of files replaced by their checksums."""
     if isinstance(value, dict):
         return {key: _without_paths(entry) for key, entry in value.items()}
     if isinstance(value, str) and value and len(value) < 4096 and Path(value).is_file():
@@ -284,7 +284,7 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 
 def _read_record(path: Path) -> dict[str, Any]:
-    """A record; empty if the file is missing or not one."""
+    """Reads a record; returns an empty one if the file is missing or invalid."""
     with suppress(ValueError):
         content = read_plain_json(path, _LARGEST_RECORD)
         if isinstance(content, dict):
@@ -353,7 +353,7 @@ def _name(path: Path) -> str:
 
 @contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
-    """Locks a folder: another command would replay the same bags."""
+    """Locks a folder, so that no other command replays into it."""
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder) as free:
         if free is False:

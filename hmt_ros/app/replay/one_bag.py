@@ -32,7 +32,7 @@ from msg_tools.messages.images import ImageError, decode_image, image_message
 
 Item = TypeVar('Item')
 
-# Maximum number of calls that wait, each with a message or an image.
+# Maximum number of waiting calls; each keeps a message or an image in memory.
 _MOST_WAITING = 32
 
 
@@ -61,7 +61,7 @@ def replay_bag(
     """Replays a bag into a new one, which is written completely or not at all.
 
     Args:
-        shows: whether progress is shown; None: unless `options.quiet`.
+        shows: whether progress is shown; None: shown unless `options.quiet`.
 
     Raises:
         ValueError: bad input.
@@ -73,7 +73,7 @@ def replay_bag(
         recorded.check_stamps(bag)
         recorded = fitted(bag, recorded, tell)
         parameters = node_parameters(options, recorded)
-        # The files that the parameters name are read before a node starts.
+        # Read the files that the parameters name, so that errors are raised before a node starts.
         subject = prepare_start(parameters.filter).initial
         if subject is None and not options.quiet and not options.people:
             sources = ' or '.join(parameters.filter.sources)
@@ -93,7 +93,7 @@ def replay_bag(
             if recorded.transforms and TF_STATIC in recorded.transforms:
                 topic = absolute_name(recorded.transforms[TF_STATIC].name)
                 out.add_topic(topic, TRANSFORMS_TYPE, latched=True)
-            # Bytes are compressed and images decoded while the next image is tracked.
+            # Writing and decoding run in threads of their own while an image is tracked.
             hidden = options.quiet if shows is None else not shows
             with (
                 WriteBehind() as behind,
@@ -135,7 +135,7 @@ def _subject_hint(bag: Path) -> str:
 
 
 def _used(recorded: RecordedInput, parameters: NodeParameters) -> RecordedInput:
-    """The topics that some node uses."""
+    """The topics that at least one node uses."""
     tracking, bme = parameters.filter, parameters.bme
     rows = session_of(tracking).inputs_of(tracking)
     used = [row for row in rows if row.is_used(tracking)]
@@ -159,9 +159,9 @@ def _play(
     bar: Progress,
     tell: Tell,
 ) -> Replayed:
-    """Hands the messages of the bag to the nodes, and copies those that the new bag keeps."""
+    """Passes the messages of the bag to the nodes, and copies some into the new bag."""
     result = Replayed()
-    # Small inputs are copied, so that a replay of the new bag has the same as this one.
+    # Small inputs are copied, so that the new bag can be replayed with the same inputs.
     small = {source for row in RECORDED if row.pixels is None for source in row.types}
     copied = {GROUND_TRUTH, *small, *TRANSFORMS}
     if options.with_images:
@@ -169,7 +169,7 @@ def _play(
 
     def check(handled: Handled) -> None:
         behind.check()
-        # A pose_mixture may say that nobody is in view; several people may be.
+        # A pose_mixture may be empty, and several people may be tracked in one image.
         result.tracked += len(
             {stamp for topic, stamp in handled.published if topic.endswith('human_joint_states')}
         )
@@ -186,7 +186,7 @@ def _play(
     with ReadAhead(partial(_read, messages, not options.live), messages.close) as ahead:
         for source, stored, given in _readable(ahead, options.keep_going, tell):
             if source in copied:
-                # Inputs keep their names, whatever the namespace of the results.
+                # Inputs keep their names in spite of the namespace of the results.
                 topic = absolute_name(stored.topic)
                 behind.call(out.write, topic, stored.log_time_ns, stored.message)
             if source == GROUND_TRUTH:
@@ -201,11 +201,11 @@ def _play(
 
 
 def _read(messages: Iterator[tuple[str, BagMessage]], decode: bool) -> tuple[str, BagMessage, Any]:
-    """Source and message of the next message, and its form for the nodes: images may be decoded.
+    """Source, message and form for the nodes of the next message; images may be decoded.
 
     Raises:
-        BagError: its bytes are not a message; the next one can still be read.
-        StopIteration: there is none.
+        BagError: its bytes are not a message; the next message can still be read.
+        StopIteration: there is no further message.
     """
     source, stored = next(messages)
     given = stored.message
@@ -213,7 +213,7 @@ def _read(messages: Iterator[tuple[str, BagMessage]], decode: bool) -> tuple[str
         try:
             picture = decode_image(given)
         except ImageError:
-            # The node that gets it reports the fault.
+            # The node that receives it reports the fault.
             return source, stored, given
         given = image_message(
             RosbagsMessages(), picture, time_ns(given.header.stamp), str(given.header.frame_id)
@@ -224,10 +224,10 @@ def _read(messages: Iterator[tuple[str, BagMessage]], decode: bool) -> tuple[str
 def _readable(
     messages: Iterator[tuple[str, BagMessage, Any]], keep_going: bool, tell: Tell
 ) -> Iterator[tuple[str, BagMessage, Any]]:
-    """The messages that can be read, up to a damaged place.
+    """Yields the messages that can be read, up to a damaged place.
 
     Raises:
-        BagError: a message can not be read, and the replay is not to keep going.
+        BagError: a message can not be read, and `keep_going` is false.
     """
     while True:
         try:
@@ -259,13 +259,13 @@ def _why_nothing(result: Replayed, subject: object, detected: bool) -> str:
 
 
 class ReadAhead(AbstractContextManager['ReadAhead[Item]'], Generic[Item]):
-    """An iterator that makes its next item while the present one is in use.
+    """An iterator that makes its next item while the current one is in use.
 
-    Iteration can go on after an error. The context manager ends the thread.
+    Iteration can continue after an error. The context manager ends the thread.
 
     Args:
-        make: makes the next item, or raises StopIteration.
-        close: is called at the end, in the thread of `make`.
+        make: returns the next item, or raises StopIteration.
+        close: called at the end, in the thread of `make`.
     """
 
     def __init__(self, make: Callable[[], Item], close: Callable[[], None]) -> None:
@@ -289,11 +289,11 @@ class ReadAhead(AbstractContextManager['ReadAhead[Item]'], Generic[Item]):
 
 
 class WriteBehind(AbstractContextManager['WriteBehind']):
-    """Makes calls in their order while the caller goes on.
+    """Makes calls in order in a thread, while the caller continues.
 
-    The context manager waits for all calls at its end, or drops them on an error. An error of a
-    call is raised by `check`, or at the end, and later calls are not made. `call` itself raises
-    nothing, so that its caller does not take such an error for one of its own.
+    The context manager waits for all calls at its end, or drops them on an error. `check` and the
+    end of the context raise the error of a call; later calls are not made. `call` itself raises
+    nothing, so that its caller does not mistake such an error for its own.
     """
 
     def __init__(self) -> None:
@@ -307,13 +307,13 @@ class WriteBehind(AbstractContextManager['WriteBehind']):
             self.check()
 
     def call(self, function: Callable[..., None], *arguments: Any) -> None:
-        """Makes a call once the earlier ones are done."""
+        """Queues a call, which is made after all earlier calls."""
         while self._waiting and (len(self._waiting) >= _MOST_WAITING or self._waiting[0].done()):
             self._waiting.popleft().result()
         self._waiting.append(self._thread.submit(self._make, function, arguments))
 
     def check(self) -> None:
-        """Raises the error of a call, if there was one."""
+        """Raises the error of a call, if one has failed."""
         if self._error is not None:
             raise self._error
 

@@ -1,4 +1,4 @@
-"""Options of a replay, and the parameters of the nodes that follow from them."""
+"""Options of a replay, and the resulting parameters of the nodes."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ from msg_tools.files.plain_yaml import load_plain_yaml
 
 FILTER, SMOOTHER, BME = 'filter_node', 'smoother_node', 'bme_node'
 PEOPLE_NODE = 'people_node'
-# Times of images: their stamps, or when they were recorded.
+# Choices of image times: stamps or log times.
 STAMPS, LOG_TIMES = 'stamps', 'log'
-# Prefixes of the parameters of a node in --set.
+# Prefixes of the parameters of each node in --set.
 _PREFIXES = {SMOOTHER: 'smoother.', BME: 'bme.', FILTER: ''}
-# Parameters that the bag and the command decide, whatever a parameter file says.
+# Parameters that replay decides itself; those in a parameter file are ignored.
 _DECIDED_HERE = ('image_transport', 'autostart')
-# Parameters that ROS gives every node.
+# Prefixes of parameters that ROS declares for every node.
 _OF_ROS = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
-# Stands for the folder of a bag in the options that name files of one person.
+# Placeholder for the folder of a bag in options that name files of one person.
 _BAG = '{bag}'
 
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """Arguments of the command, see its help, except its bags.
+    """Arguments of the command except its bags; see its help.
 
     `with_smoother` is false for --no-smoother, `settings` are the values of --set, and an empty
-    `bme` selects the model that comes with the package.
+    `bme` selects the model that ships with the package.
     """
 
     overwrite: bool = False
@@ -74,7 +74,7 @@ class ReplayOptions:
         """The topics of a bag that a replay with these options reads.
 
         Raises:
-            BagError: there are no images, no camera_info, or several topics to choose from.
+            BagError: there are no images or no camera_info, or the choice is ambiguous.
         """
         found = recorded_input(
             bag,
@@ -91,12 +91,12 @@ class ReplayOptions:
         return replace(found, upright_frame=frame, by_log=self.times == LOG_TIMES)
 
     def of_bag(self, source: Path) -> ReplayOptions:
-        """The options for one bag: `{bag}` in names of files becomes its folder."""
+        """The options for one bag, with its folder in place of `{bag}` in file names."""
         folder = str(source if source.is_dir() else source.parent)
         return self._renamed(lambda name: name.replace(_BAG, folder))
 
     def with_absolute_paths(self) -> ReplayOptions:
-        """The options with names of files that are valid in any working directory."""
+        """The options with absolute file names, which are valid in any working directory."""
 
         def absolute(name: str) -> str:
             return str(Path(name).absolute()) if Path(name).is_file() else name
@@ -105,7 +105,7 @@ class ReplayOptions:
         return replace(self._renamed(absolute), config=config)
 
     def _renamed(self, rename: Callable[[str], str]) -> ReplayOptions:
-        """The options with other names of the files of a person."""
+        """The options with changed names of the files of a person."""
 
         def path(value: Path | None) -> Path | None:
             return None if value is None else Path(rename(str(value)))
@@ -120,9 +120,9 @@ class ReplayOptions:
 
 
 class NodeParameters(NamedTuple):
-    """Parameters of the nodes; None for a node that does not take part.
+    """Parameters of the nodes; None for a node that does not run.
 
-    Those of the filter are those of the people node where several people are tracked.
+    `filter` has the parameters of the people node if several people are tracked.
     """
 
     filter: FilterParameters
@@ -178,9 +178,9 @@ def _filter_parameters(options: ReplayOptions, recorded: RecordedInput) -> Filte
 
 
 def _tracking_values(options: ReplayOptions, recorded: RecordedInput, node: str) -> dict[str, Any]:
-    """Values for a node that tracks; inputs and transforms of a bag are used where there are some.
+    """Values for a tracking node, which uses all inputs and transforms in the bag.
 
-    Values that the user gives take precedence.
+    Values given by the user take precedence.
     """
     values = _given_values(options, node)
     given = {
@@ -201,7 +201,7 @@ def _tracking_values(options: ReplayOptions, recorded: RecordedInput, node: str)
 
 
 def _people_parameters(options: ReplayOptions, recorded: RecordedInput) -> PeopleParameters:
-    """Parameters of the people node, which takes the place of all other nodes."""
+    """Parameters of the people node, which replaces all other nodes."""
     unfit: dict[str, object] = {
         '--live': options.live,
         '--subject': options.subject,
@@ -225,7 +225,7 @@ def _smoother_parameters(options: ReplayOptions) -> SmootherParameters:
     if options.seed is not None:
         values['random_seed'] = options.seed
     if options.body is not None:
-        # The name in the messages does not lead to the file of the body.
+        # The name of the body in the messages does not identify its file.
         values['body_model'] = options.body
     return with_values(SmootherParameters(), values)
 
@@ -252,7 +252,7 @@ def _given_values(options: ReplayOptions, node: str) -> dict[str, Any]:
     """Values from --config and --set for a node, by name."""
     values: dict[str, Any] = {}
     for file in options.config:
-        # Sections for all nodes go to the filter: many names mean something else to the smoother.
+        # Sections for all nodes apply to the filter only: many names differ in meaning elsewhere.
         read = read_parameter_file(file, node, by_name=node not in (FILTER, PEOPLE_NODE))
         values.update(
             (name, value)

@@ -1,4 +1,4 @@
-"""The player, a ROS node that feeds the real nodes, in a domain of its own on this machine."""
+"""The player, a ROS node that sends messages to the real nodes, in a domain of its own."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from unittest.mock import patch
 
 
 class LiveNodeError(ValueError):
-    """A node did not start or does not answer; one line."""
+    """A node did not start or does not answer; the message is one line."""
 
 
 class Player:
     """A ROS node in a domain of its own that publishes for other nodes and subscribes to them.
 
     Raises:
-        LiveNodeError: there is no ROS.
+        LiveNodeError: ROS is not available.
     """
 
     def __init__(self, opened: ExitStack) -> None:
@@ -86,7 +86,7 @@ class Player:
         self.executor = SingleThreadedExecutor(context=context)
         opened.callback(self.executor.shutdown)
         self.executor.add_node(self.node)
-        # Newest diagnostics of each node, by its name.
+        # Newest diagnostics by node name.
         self.diagnostics: dict[str, dict[str, str]] = {}
 
         def diagnosed(message: DiagnosticArray) -> None:
@@ -99,7 +99,7 @@ class Player:
 
 @contextmanager
 def reserved_domain() -> Iterator[int]:
-    """A ROS domain that no other replay or test run on this machine uses.
+    """Reserves a ROS domain that no other replay or test run on this machine uses.
 
     As in ament's domain_coordinator, a domain is in use while port 32768 + domain is bound.
     """
@@ -116,5 +116,5 @@ def reserved_domain() -> Iterator[int]:
 
 
 def environment(domain: int) -> dict[str, str]:
-    """Environment variables of a process in a domain, on this machine only."""
+    """Environment variables of a process in a domain that is limited to this machine."""
     return {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}

@@ -1,9 +1,9 @@
-"""BME, filter and smoother take the messages of a bag, offline or as real nodes.
+"""BME, filter and smoother process the messages of a bag, offline or as real nodes.
 
-The BME takes each image before the filter, which takes the `pose_prediction` of the BME; the
-smoother takes the `likelihood_mixture` of the filter, and the BME its `pose_mixture` if it is to
-predict less often while the person is tracked; then the next message follows. At the end of
-the bag they finish, in the same order: no message announces the end, so nodes are deactivated.
+The BME gets each image before the filter, which also gets the `pose_prediction` of the BME. The
+smoother gets the `likelihood_mixture` of the filter; the BME gets its `pose_mixture` if it predicts
+less often while the person is tracked. Then the next message is processed. At the end of the bag
+they finish in the same order; no message announces the end, so nodes are deactivated.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ Write = Callable[[str, int, bytes], None]
 
 
 class PlayedTrack(AbstractContextManager['PlayedTrack'], ABC):
-    """Takes the messages of a bag one after the other; a context manager.
+    """Processes the messages of a bag one by one; a context manager.
 
     Args:
-        write: takes topic, stamp and bytes of each published message.
+        write: called with topic, stamp and bytes of each published message.
     """
 
     def __init__(self, parameters: NodeParameters, write: Write) -> None:
@@ -50,9 +50,9 @@ class PlayedTrack(AbstractContextManager['PlayedTrack'], ABC):
         self._bme: Any = None
         self._filter: Any = None
         self._smoother: Any = None
-        # Sources in the bag that the BME takes.
+        # Sources in the bag that the BME gets.
         self._seen: tuple[str, ...] = ()
-        # Topics of the filter that BME and smoother take, as sources of the same names.
+        # Topics of the filter that BME and smoother get, as sources of the same names.
         self._heard: tuple[str, ...] = ()
         self._smoothed = () if parameters.smoother is None else (MIXTURE,)
         if (bme := parameters.bme) is not None:
@@ -63,21 +63,21 @@ class PlayedTrack(AbstractContextManager['PlayedTrack'], ABC):
 
     @abstractmethod
     def _handled(self, node: Any, source: str, message: Any = None) -> Handled:
-        """How a node handles a message; None: the newest on the topic of another node."""
+        """Passes a message to a node; None: the oldest waiting one from another node."""
 
     @abstractmethod
     def _finished(self, node: Any) -> Handled:
-        """How a node handles the messages that wait for others, at the end of the bag."""
+        """Makes a node handle its waiting messages at the end of the bag."""
 
     def take(self, source: str, message: Any) -> Handled:
-        """Hands a message over and returns when all its results are written."""
+        """Passes a message to the nodes and returns when all results are written."""
         result = None
         if source in self._seen:
             result = self._predicted(self._handled(self._bme, source, message))
         return self._handed_on(_together(result, self._handled(self._filter, source, message)))
 
     def finish(self) -> Handled:
-        """Returns when the results that waited for more messages are written."""
+        """Ends the bag and returns when all remaining results are written."""
         result = None
         if self._bme is not None:
             result = self._predicted(self._finished(self._bme))
@@ -88,13 +88,13 @@ class PlayedTrack(AbstractContextManager['PlayedTrack'], ABC):
         return result
 
     def _predicted(self, result: Handled) -> Handled:
-        """The filter gets the predictions as well."""
+        """Passes the predictions to the filter."""
         for topic, _ in result.published:
             result = _together(result, self._handled(self._filter, topic))
         return result
 
     def _handed_on(self, result: Handled) -> Handled:
-        """Smoother and BME get the messages of the filter."""
+        """Passes the messages of the filter to smoother and BME."""
         for topic, _ in result.published:
             if topic in self._smoothed:
                 result = _together(result, self._handled(self._smoother, topic))
@@ -105,7 +105,7 @@ class PlayedTrack(AbstractContextManager['PlayedTrack'], ABC):
 
 
 class OfflineTrack(PlayedTrack):
-    """Without ROS.
+    """A track without ROS.
 
     Raises:
         ValueError: the parameters name a file that can not be used.
@@ -113,7 +113,7 @@ class OfflineTrack(PlayedTrack):
 
     def __init__(self, parameters: NodeParameters, write: Write) -> None:
         super().__init__(parameters, write)
-        # Messages of a node for another one, by topic.
+        # Messages from one node for another, by topic.
         self._messages: defaultdict[str, deque[Any]] = defaultdict(deque)
         if parameters.bme is not None:
             self._bme = BmeSession(parameters.bme, self._publish, bme_session.TOPICS.__contains__)
@@ -127,7 +127,7 @@ class OfflineTrack(PlayedTrack):
                 self._smoother.share(images)
 
     def __exit__(self, *_: object) -> None:
-        """See `PlayedTrack`; nothing is open."""
+        """See `PlayedTrack`; there is nothing to close."""
 
     def _publish(self, output: Output) -> None:
         self._write(*output)
@@ -150,7 +150,7 @@ class LiveTrack(PlayedTrack):
         together: whether the nodes run in one process.
 
     Raises:
-        LiveNodeError: there is no ROS, or a node does not start, answer or end.
+        LiveNodeError: ROS is not available, or a node does not start, answer or end.
     """
 
     def __init__(self, parameters: NodeParameters, write: Write, *, together: bool = False) -> None:
@@ -178,7 +178,7 @@ class LiveTrack(PlayedTrack):
                 names = [name for name, own in every if own is not None]
                 process = NodeProcess(player, opened, PERSON, f'hmt_ros.nodes.{PERSON}', names)
             live = partial(LiveNode, player, opened, within=process, write=self._write)
-            # Topics of the namespace that both share: none of their messages must be lost.
+            # Topics that filter and BME share; none of their messages may be lost.
             sensors = (f'/{topic}', '/camera_info', *(f'/{source}' for source in given))
             if self._parameters.bme is not None:
                 self._bme = live(
@@ -201,7 +201,7 @@ class LiveTrack(PlayedTrack):
             if self._bme is not None:
                 self._bme.wait_until_active()
                 self._bme.wait_for_subscribers((PREDICTION,), 2)
-                # Nodes of one process listen once.
+                # Nodes in one process share one subscription.
                 self._filter.wait_until_heard(self._seen, 1 if self._together else 2)
                 self._filter.wait_for_subscribers(self._heard, 2)
             if self._smoother is not None:
@@ -227,7 +227,7 @@ class LiveTrack(PlayedTrack):
         return super().take(source, message)
 
     def _handled(self, node: LiveNode, source: str, message: Any = None) -> Handled:
-        """See `PlayedTrack`: a node has the messages by itself."""
+        """See `PlayedTrack`; the node receives the messages over DDS."""
         return node.answer(source)
 
     def _finished(self, node: LiveNode) -> Handled:
@@ -237,14 +237,14 @@ class LiveTrack(PlayedTrack):
 
 
 def _is_recorded(topic: str) -> bool:
-    """Whether bags have a topic of a session that tracks."""
+    """Whether a topic of a tracking session is recorded in bags."""
     return topic.rpartition('/')[2] not in track_messages.TOPICS_OF_NODE.keys() - (
         track_messages.TOPICS.keys()
     )
 
 
 def _together(one: Handled | None, other: Handled) -> Handled:
-    """The handling of a message and of one that it led to, in one record."""
+    """Merges the handling of a message with that of a message that resulted from it."""
     if one is None:
         return other
     return Handled(

@@ -23,12 +23,12 @@ from msg_tools import BagReader
 from msg_tools.files.new_folder import FolderKind
 
 PAGE = 'report.html'
-# Largest page, largest part of it for data before times are left out, and largest part for images:
-# this, and as much again for each second. Bytes.
+# Maximum size of the page, of its data (more times are left out), and of its images at the start
+# and for each second, bytes.
 PAGE_BYTES = 19_500_000
 DATA_BYTES = 12_000_000
 IMAGE_BYTES = 700_000
-# Program and scores, whose size does not grow with time, bytes.
+# Size of program and scores, which does not grow with time, bytes.
 REST_BYTES = 200_000
 MAX_TIMES = 600
 _FOLDER = FolderKind('a report', PAGE, tuple(PICTURES))
@@ -55,7 +55,7 @@ exit code: 0 done, 1 bad input (one line on stderr explains it), 130 interrupted
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Arguments of the command, see its help; `notes` are lines that the page shows, too."""
+    """Arguments of the command, see its help; `notes` are additional lines on the page."""
 
     bag: Path
     output: Path
@@ -72,7 +72,7 @@ class ReportOptions:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; 0: the report is there, 1: bad input, which one line on stderr explains."""
+    """Runs the command; returns 0 when done, 1 for bad input (one line on stderr explains it)."""
     return run_command(_parser(), _report, argv, whole_or_nothing=True)
 
 
@@ -113,10 +113,10 @@ def write_report(options: ReportOptions) -> tuple[Content, str]:
     """Writes a report.
 
     Returns:
-        The content of the page, and lines that list the files.
+        The content of the page, and lines of text that list the files.
 
     Raises:
-        ValueError, OSError: bad input; one line that explains it.
+        ValueError, OSError: bad input, explained in one line.
     """
     _FOLDER.check_place(options.output, overwrite=options.overwrite)
     source = image_source(
@@ -201,7 +201,7 @@ def _content(options: ReportOptions, source: ImageSource | None, bar: Progress) 
 
 
 def _with_truth(mixtures: RecordedMixtures, truth: Truth) -> list[str]:
-    """Topics that can be scored; all, where none can be, so that the error says why."""
+    """Topics that can be scored; all topics if none can, so that scoring raises the error."""
     stamps = {layer.topic: set(layer.mixtures) for layer in mixtures.layers}
     for layer in mixtures.trajectories:
         if layer.joint_names:  # without a body there are no joints
@@ -213,7 +213,7 @@ def _with_truth(mixtures: RecordedMixtures, truth: Truth) -> list[str]:
 
 
 def _shown(mixtures: RecordedMixtures, most: int) -> list[int]:
-    """Times that are shown: all, or every n-th if the page would get too large."""
+    """Times to show: all, or every n-th if the page would get too large."""
     stamps = mixtures.stamps
     most = min(most, int(len(stamps) * min(DATA_BYTES / max(data_size(mixtures), 1), 1.0)))
     return stamps[:: -(-len(stamps) // max(most, 1))]

@@ -1,4 +1,4 @@
-"""Skeletons of a detector that lifts by itself, beside the mixtures."""
+"""Skeletons of a detector that gives 3D positions, for comparison with the mixtures."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class Detector:
 
     Attributes:
         topic: name of the topic.
-        joint_names: (J,) joints of the body, those that its landmarks are at.
-        joints: (J, 3) by stamp in ns, m, camera optical frame, the middle of the hips at that of
-            the heaviest mode; NaN where a joint was not seen.
-        confidences: by stamp, the mean of all landmarks.
+        joint_names: (J,) joints of the body at which the detector has landmarks.
+        joints: (J, 3) positions by stamp in ns, m, camera optical frame, shifted so that the
+            pelvis is at that of the heaviest mode; NaN where a joint was not seen.
+        confidences: mean confidence of all landmarks, by stamp.
     """
 
     topic: str
@@ -38,18 +38,18 @@ class Detector:
 
 
 def read_detector(path: Path, layer: Layer[Moment]) -> Detector | None:
-    """The detector's skeletons at the times of a layer, on whose hips they are put.
+    """Reads the skeletons of the detector at the times of a layer, shifted to its pelvis.
 
     Args:
         path: path of the bag.
-        layer: the mixtures that are shown; the detector is on the topic of the same namespace, or
-            else on the only one of the bag.
+        layer: the mixtures to show; the topic of the detector is in the same namespace, or else
+            the only one of its type in the bag.
 
     Returns:
-        The skeletons; None: the bag has none with hips at these times.
+        The skeletons; None if the bag has none with a pelvis or hips at these times.
 
     Raises:
-        ValueError: a message that can not be understood.
+        ValueError: an invalid message.
     """
     names, found, confidences = layer.joint_names, {}, {}
     with BagReader(path) as bag:
@@ -74,7 +74,7 @@ def read_detector(path: Path, layer: Layer[Moment]) -> Detector | None:
 
 
 def _at_joints(positions: Positions, names: tuple[str, ...]) -> dict[str, Array]:
-    """Positions of joints: the mean of the landmarks that vary the least between people."""
+    """Position of each joint: the mean of its landmarks that vary least between people."""
     found: dict[str, dict[float, list[Array]]] = {}
     marks = landmarks_of(positions.names, names)
     for name, mark, place in zip(positions.names, marks, positions.positions, strict=True):
@@ -85,7 +85,7 @@ def _at_joints(positions: Positions, names: tuple[str, ...]) -> dict[str, Array]
 
 
 def _with_middles(joints: dict[str, Array]) -> dict[str, Array]:
-    """The joints, with pelvis and neck in the middle of hips and shoulders that are known."""
+    """The joints, with pelvis and neck at the middle of hips and shoulders if these are known."""
     middles = {
         name: np.mean([joints[end] for end in ends], axis=0)
         for name, ends in _MIDDLES.items()

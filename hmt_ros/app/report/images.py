@@ -1,4 +1,4 @@
-"""Images of a bag as JPEGs that together are small enough for a page."""
+"""Images of a bag as JPEGs whose total size is small enough for a page."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from msg_tools.messages.camera_info import camera_from_info
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import decode_image, encode_jpeg
 
-# Width in px and quality, from the best to the smallest.
+# Width in px and JPEG quality, from the best to the smallest.
 _LEVELS = (
     (640, 80),
     (640, 65),
@@ -35,12 +35,12 @@ _LEVELS = (
 
 @dataclass(frozen=True)
 class ImageSource:
-    """The place of the images of a report.
+    """The source of the images of a report.
 
     Attributes:
-        bag: path of their bag.
+        bag: path of the bag.
         topic: topic of the images.
-        camera_info: topic of their calibration; None: the modes are already drawn on them.
+        camera_info: topic of their calibration; None if the modes are already drawn on them.
     """
 
     bag: Path
@@ -55,7 +55,7 @@ class FilmStrip:
     Attributes:
         camera: camera of the images; None if unknown.
         size: (width, height) of the images in the bag, px; (0, 0) without images.
-        jpegs: JPEG files, scaled down.
+        jpegs: JPEG files of the images, scaled down.
         kept: some of the images at their full size, (H, W, 3) BGR.
     """
 
@@ -68,18 +68,18 @@ class FilmStrip:
 def image_source(
     out: Path, images: Path | None, image_topic: str | None, camera_info_topic: str | None
 ) -> ImageSource | None:
-    """The place of the images that belong to a bag of mixtures; None: there are none.
+    """Finds the images that belong to a bag of mixtures; returns None if there are none.
 
-    The images in the bag `images`; else those in `out`, with calibration; else the drawings of the
-    tracker in `out`.
+    The images are those in the bag `images`, else those in `out` if it has a calibration, else the
+    drawings of the tracker in `out`.
 
     Args:
         out: bag of the mixtures.
-        images: bag of the images; None if unknown.
+        images: bag of the images; None if not given.
         image_topic, camera_info_topic: names that replace the automatic choice.
 
     Raises:
-        BagError: wanted images or calibration are missing, or there are several to choose from.
+        BagError: wanted images or calibration are missing, or are ambiguous.
     """
     path = out if images is None else images
     with BagReader(path) as bag:
@@ -103,20 +103,20 @@ def film_strip(
     keep: Collection[int] = (),
     progress: Callable[[int], object] = lambda count: None,
 ) -> FilmStrip:
-    """The images at some stamps.
+    """Reads the images at some stamps as JPEGs.
 
-    Each gets an equal part of the bytes; the first one that does not fit makes all later ones
-    smaller.
+    Each image gets an equal part of the bytes; once one does not fit, all later images are
+    scaled down as well.
 
     Args:
-        source: place of the images.
+        source: source of the images.
         stamps: stamps of the wanted images.
-        allowed: size of all JPEGs together, bytes.
-        keep: stamps of the images that are also wanted at full size.
+        allowed: maximum total size of the JPEGs, bytes.
+        keep: stamps of the images to keep at full size as well.
         progress: called with the number of images that were read.
 
     Raises:
-        ValueError: no image has such a stamp, one can not be decoded, or they differ in size.
+        ValueError: no image has a wanted stamp, an image can not be decoded, or sizes differ.
     """
     wanted = set(stamps)
     result = FilmStrip()
@@ -127,7 +127,7 @@ def film_strip(
             progress(1)
             stamp = time_ns(stored.message.header.stamp)
             if stamp not in wanted and stored.log_time_ns in wanted:
-                stamp = stored.log_time_ns  # tracked with --times log
+                stamp = stored.log_time_ns  # the bag was tracked with --times log
             seen.append(stamp)
             if stamp not in wanted or stamp in result.jpegs:
                 continue
@@ -158,7 +158,7 @@ def film_strip(
 
 
 def _small(image: Image, allowed: int, level: int) -> tuple[bytes, int]:
-    """The best JPEG of an image within the bytes, or else the smallest, and its level."""
+    """The best JPEG of an image that fits into the bytes, or else the smallest, and its level."""
     while True:
         width, quality = _LEVELS[level]
         scaled = image

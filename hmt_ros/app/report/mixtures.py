@@ -24,18 +24,18 @@ from msg_tools.messages.keep_out import KEEP_OUT, KeepOutState
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, PoseMixture, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
 
-# Ends and middle of an interval that holds 90 %.
+# Probabilities of the lower end, the median and the upper end of a 90 % interval.
 PROBABILITIES = np.array([0.05, 0.5, 0.95])
-# Above a camera that is level.
+# Plane through a level camera, in place of an unknown floor.
 _LEVEL = np.array([0.0, -1.0, 0.0, 0.0])
 _HALVINGS = 22
-# Radius of the region of 90 % of a normal distribution in space, in standard deviations.
+# Radius of the 90 % region of a 3D normal distribution, in standard deviations.
 _RADIUS = 2.500278
 
-# Joints whose paths are drawn of trajectories, and how many trajectories are kept.
+# Joints whose paths are drawn for trajectories, and maximum number of trajectories.
 ENDS = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')
 KEPT_TRAJECTORIES = 8
-# Kinds whose regions, and whose heights and angles over time, are shown.
+# Kinds of mixtures that are shown with regions, and with heights and angles over time.
 BANDED = ('posterior', 'smoothed')
 _TRAJECTORIES = 'trajectories'
 _ORDER = (
@@ -50,14 +50,14 @@ _ORDER = (
 
 
 def angles_of(body: Body | None) -> tuple[str, ...]:
-    """Names of the angles of a body; none of a body that is not known."""
+    """Names of the angles of a body; empty if the body is unknown."""
     if body is None:
         return ()
     return tuple(body.dof_names[i] for i in np.flatnonzero(body.skeleton.dof_is_rotation))
 
 
 def ground_at(grounds: Mapping[int, GroundState], stamp_ns: int) -> GroundState | None:
-    """The ground at a time, or else at the first time of all; None: unknown."""
+    """The ground at a time, or else the first known ground; None if there is none."""
     return grounds.get(stamp_ns) or next(iter(grounds.values()), None)
 
 
@@ -74,10 +74,10 @@ def heights_of(joints: Array, ground: GroundState | None) -> Array:
 
 
 def marginals_of(content: PoseMixture, body: Body | None, ground: GroundState | None) -> Array:
-    """Marginals of each component over heights of joints, m, and angles, degrees.
+    """Marginals of each component over joint heights, m, and angles, degrees.
 
     Returns:
-        (2, K, J + A) means and standard deviations; (2, K, 0) where a covariance is not known.
+        (2, K, J + A) means and standard deviations; (2, K, 0) if covariances are unknown.
     """
     covariances, spread = content.covariances, content.joint_covariances
     if covariances is None or spread is None:
@@ -96,11 +96,11 @@ def marginals_of(content: PoseMixture, body: Body | None, ground: GroundState | 
 
 
 def regions_of(content: PoseMixture) -> Array:
-    """Ellipsoids that hold a joint with 90 %, relative to the pelvis, by component.
+    """Ellipsoids that contain each joint with 90 % probability, relative to the pelvis.
 
     Returns:
-        (K, J, 6) xx, yy, zz, xy, xz, yz of the matrix R, m, which takes the unit ball to the
-        ellipsoid around the joint; (K, 0, 6) where covariances are not known.
+        (K, J, 6) xx, yy, zz, xy, xz, yz of the matrix R, m, which maps the unit ball to the
+        ellipsoid around the joint; (K, 0, 6) if covariances are unknown.
     """
     spread = content.joint_covariances_relative
     if spread is None:
@@ -116,8 +116,8 @@ def intervals(weights: Array, marginals: Array) -> Array:
     """Quantiles (V, 3) of mixtures of normal distributions at `PROBABILITIES`.
 
     Args:
-        weights: (K,) sum to 1.
-        marginals: (2, K, V) means and standard deviations, above 0.
+        weights: (K,) weights that sum to 1.
+        marginals: (2, K, V) means and positive standard deviations.
     """
     means, sigmas = np.asarray(marginals, dtype=np.float64)[..., None]
     low = np.broadcast_to((means - 6.0 * sigmas).min(axis=0), (*means.shape[1:2], 3)).copy()
@@ -135,13 +135,13 @@ class Moment:
 
     Attributes:
         stamp_ns: time of the poses.
-        weights: (K,) heaviest first.
-        joints: (K, J, 3) camera optical frame, m.
-        existence: probability that a person is in view; NaN: unknown.
-        cues: probability that each cue of the images shows the person, by its name; empty: unknown.
-        identities: (K,) of the modes; 0: none.
-        marginals: (2, K, J + A) of heights and angles, see `marginals_of`; (2, K, 0): unknown.
-        regions: (K, J, 6) of the joints, see `regions_of`; (K, 0, 6): unknown.
+        weights: (K,) weights, heaviest first.
+        joints: (K, J, 3) joint positions, camera optical frame, m.
+        existence: probability that a person is in view; NaN if unknown.
+        cues: probability that each image cue shows the person, by name; empty if unknown.
+        identities: (K,) identities of the modes; 0 for none.
+        marginals: (2, K, J + A) heights and angles, see `marginals_of`; (2, K, 0) if unknown.
+        regions: (K, J, 6) regions of the joints, see `regions_of`; (K, 0, 6) if unknown.
     """
 
     stamp_ns: int
@@ -161,10 +161,10 @@ class Window:
     Attributes:
         stamp_ns: end of the window.
         stamps_ns: (T,) times of the poses.
-        weights: (M,) of all trajectories, heaviest first.
-        free_energy: (I,) per iteration, nats; empty if not recorded.
-        ways: (at most `KEPT_TRAJECTORIES`, T, J, 3) paths of the `ENDS` that the body has, m,
-            heaviest trajectory first; None if the body is unknown.
+        weights: (M,) weights of all trajectories, heaviest first.
+        free_energy: (I,) free energy per iteration, nats; empty if not recorded.
+        ways: (at most `KEPT_TRAJECTORIES`, T, J, 3) paths of those `ENDS` that are joints of the
+            body, m, heaviest trajectory first; None if the body is unknown.
     """
 
     stamp_ns: int
@@ -185,9 +185,9 @@ class Layer(Generic[Mixture]):
         topic: name of the topic.
         kind: kind of the mixtures, e.g. 'posterior', or 'trajectories'.
         frame_id: frame of the positions.
-        joint_names: (J,) of the positions.
-        mixtures: by stamp in ns, in the order of time.
-        angles: (A,) names of the angles of the body; empty: the body is not known.
+        joint_names: (J,) names of the joints.
+        mixtures: mixtures by stamp in ns, in temporal order.
+        angles: (A,) names of the angles of the body; empty if the body is unknown.
     """
 
     topic: str
@@ -203,7 +203,7 @@ class Layer(Generic[Mixture]):
         return replace(self, mixtures=chosen)
 
     def spread(self, count: int) -> list[int]:
-        """Stamps that are spread evenly over all times."""
+        """A number of stamps that are spread evenly over all times."""
         last = len(self.mixtures) - 1
         chosen = np.unique(np.rint((np.arange(count) + 0.5) / count * last).astype(int))
         stamps = list(self.mixtures)
@@ -215,9 +215,9 @@ class RecordedMixtures:
     """The mixtures in a bag.
 
     Attributes:
-        layers: mixtures over poses, those of the posterior first.
+        layers: mixtures over poses, the posterior first.
         trajectories: mixtures over trajectories.
-        answered: by stamp of an image, ns, what is missing where no pose is known; '': nothing.
+        answered: by stamp of an image, ns, the reason why it has no pose; '' if it has one.
     """
 
     layers: list[Layer[Moment]]
@@ -226,7 +226,7 @@ class RecordedMixtures:
 
     @property
     def stamps(self) -> list[int]:
-        """Times of images, poses and ends of windows, increasing; without poses all of windows."""
+        """Sorted times of images, poses and ends of windows; all window times without poses."""
         stamps = {*self.answered, *(stamp for layer in self.layers for stamp in layer.mixtures)}
         for layer in self.trajectories:
             stamps.update(layer.mixtures)
@@ -241,7 +241,7 @@ class RecordedMixtures:
         return set(self.answered).difference(*(layer.mixtures for layer in self.layers), *windows)
 
     def at(self, stamps: Iterable[int]) -> RecordedMixtures:
-        """The mixtures at some times only; the windows that end then, or else the last."""
+        """The mixtures at some times only, and windows that end at them, or else the last one."""
         wanted = set(stamps)
         layers = [layer.at(wanted) for layer in self.layers]
         return RecordedMixtures(
@@ -262,17 +262,17 @@ def read_mixtures(
     grounds: Mapping[int, GroundState] | None = None,
     progress: Callable[[int], object] = lambda count: None,
 ) -> RecordedMixtures:
-    """The mixtures in a bag; of several on one topic with the same stamp, the first.
+    """Reads the mixtures in a bag; the first of several with one topic and stamp counts.
 
     Args:
         path: path of the bag.
-        topics: names of the topics to read; empty: all with mixtures except ground truth.
-        body_model: name or file of the body model, for a bag whose own name for it is unknown.
-        grounds: the ground by stamp, for heights.
+        topics: names of the topics to read; empty: all topics of mixtures except ground truth.
+        body_model: name or file of the body model, if the name in the bag is unknown.
+        grounds: ground by stamp, for heights.
         progress: called with the number of messages that were read.
 
     Raises:
-        ValueError: no mixtures, messages that can not be understood, or several frames.
+        ValueError: no mixtures, invalid messages, or several frames.
     """
     found: dict[str, Layer[Any]] = {}
     with BagReader(path) as bag:
@@ -334,7 +334,7 @@ def _take(
 def _pose_layer(
     topic: str, bodies: RecordedBodies, grounds: Mapping[int, GroundState], message: Any
 ) -> Layer[Moment] | None:
-    """A layer of one mixture; None: nobody was seen."""
+    """A layer of one mixture; None if nobody was seen."""
     content = pose_mixture_of(message)
     if not len(content.weights):
         return None

@@ -1,7 +1,7 @@
-"""One HTML page that shows the mixtures in a bag, and needs nothing but a browser.
+"""One HTML page that shows the mixtures in a bag, and needs only a browser.
 
 Data, style and program are in the page itself. Positions are 16-bit multiples of a step, relative
-to the middle of all positions, in base64. `page_data` describes the data.
+to the centre of all positions, in base64. `page_data` describes the data.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.calibration import coverage
 from msg_tools.messages.ground import GroundState
 
-# Least step of positions and step of regions, m; of pixels as a fraction of the width of the image.
+# Minimum step of positions, and step of regions, m; step of pixels, in widths of the image.
 FINEST, _REGION = 5e-4, 1e-4
 _PIXEL = 1 / 8000
-_NOWHERE = -(2**15)  # a pixel of a point that can not be seen
+_NOWHERE = -(2**15)  # code of NaN, and of pixels of invisible points
 _LARGEST = 2**15 - 1
 _SIDES = {LEFT: 'left', RIGHT: 'right'}
 _SCRIPTS = ('data.js', 'view.js', 'charts.js', 'report.js')
@@ -52,14 +52,14 @@ class Content:
 
     Attributes:
         title: title of the page.
-        stamps: (T,) times that are shown, ns, increasing.
+        stamps: (T,) increasing times to show, ns.
         mixtures: mixtures at these times.
-        images: images at some of them.
+        images: images at some of these times.
         truth: true joint positions; None if unknown.
-        scores: by topic; empty without truth.
+        scores: scores by topic; empty without truth.
         notes: contents that the page leaves out, and why.
-        grounds: floor and contacts by stamp; empty: unknown.
-        detector: skeletons of a detector that lifts; None: there are none.
+        grounds: floor and contacts by stamp; empty if unknown.
+        detector: skeletons of a detector of 3D positions; None if there are none.
     """
 
     title: str
@@ -74,17 +74,17 @@ class Content:
 
 
 def data_size(mixtures: RecordedMixtures) -> int:
-    """Upper estimate of the bytes that mixtures take in a page."""
+    """Approximate upper bound of the size of mixtures in a page, bytes."""
     size = 0
     for layer in mixtures.layers:
-        # Positions of 6 bytes and pixels of 4 in base64; weight and error as text.
+        # Base64 of 6 bytes per position and 4 per pixel; weight and error as text.
         each = len(layer.joint_names) * 10 * 4 // 3 + 16
         for moment in layer.mixtures.values():
             # Probabilities as text.
             size += len(moment.weights) * each + 8 * (1 + len(moment.cues))
-            # Intervals of 6 bytes in base64, and identities as text.
+            # Base64 of 6 bytes per interval; identities as text.
             size += 8 * moment.marginals.shape[2] + 8 * len(moment.weights)
-            # Regions of 2 bytes a number in base64.
+            # Base64 of 2 bytes per number of a region.
             size += 8 * moment.regions.size // 3
     for topic in mixtures.trajectories:
         for window in topic.mixtures.values():
@@ -95,13 +95,13 @@ def data_size(mixtures: RecordedMixtures) -> int:
 
 
 def page_html(content: Content) -> str:
-    """The text of the page."""
+    """Returns the text of the page."""
     folder = resources.files('hmt_ros.app.report').joinpath('page')
     parts = {
         'title': html.escape(content.title),
         'style': folder.joinpath('report.css').read_text('utf-8'),
         'script': '\n'.join(folder.joinpath(name).read_text('utf-8') for name in _SCRIPTS),
-        # Nothing in a JSON string may end the element that it stands in.
+        # No JSON string may end the HTML element around it.
         'data': json.dumps(page_data(content), separators=(',', ':'), allow_nan=False).replace(
             '<', '\\u003c'
         ),
@@ -113,11 +113,12 @@ def page_html(content: Content) -> str:
 
 
 def ground_data(grounds: dict[int, GroundState], stamps: Collection[int]) -> dict[str, Any] | None:
-    """The ground in the data of the page; None: nothing is known at these times.
+    """The ground in the data of the page; None if it is unknown at all these times.
 
     Returns:
-        For each time or None: `planes`, (a, b, c, d) with a x + b y + c z + d = 0 on the floor, m,
-        camera optical frame; `contacts`, the probability that a foot stands on it by its side.
+        `planes`: for each time (a, b, c, d) with a x + b y + c z + d = 0 on the floor, m, camera
+        optical frame, or None; `contacts`: for each time the probability that the foot of each
+        side is on the floor.
     """
     shown = [grounds.get(stamp) for stamp in stamps]
     planes = [None if one is None else one.plane for one in shown]
@@ -138,11 +139,11 @@ def ground_data(grounds: dict[int, GroundState], stamps: Collection[int]) -> dic
 def page_data(content: Content) -> dict[str, Any]:
     """The data of the page.
 
-    Positions are `origin + step * int16`, m, in the camera optical frame: of each layer (modes of
-    all times in turn, joints, 3), of trajectories (component, time, end, 3). Pixels are `int16`
-    times 1/8000 of the width of the image, from the centre of the first pixel; regions of
-    `regions_of` are `region * int16`, m. -32768 is no number. The middle of the
-    joints `roots` of a skeleton is aligned with that of the others on demand.
+    Positions are `origin + step * int16`, m, in the camera optical frame, with the shape (modes of
+    all times in turn, joints, 3) for a layer and (component, time, end, 3) for trajectories. Pixels
+    are `int16` times 1/8000 of the width of the image, from the centre of the first pixel; regions
+    of `regions_of` are `region * int16`, m. -32768 means NaN. The page can align skeletons at the
+    centre of their joints `roots`.
     """
     grid = _Grid.around(content)
     stamps, truth = content.stamps, content.truth
@@ -173,7 +174,7 @@ def page_data(content: Content) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """The points to which positions are rounded, m."""
+    """The grid of points to which positions are rounded, m."""
 
     origin: Array
     step: float
@@ -232,7 +233,7 @@ def _layer(layer: Layer[Moment], content: Content, grid: _Grid) -> dict[str, Any
 
 
 def _regions(moments: Sequence[Moment]) -> str | None:
-    """Regions of the joints of all modes; None: those of some are not known."""
+    """Regions of the joints of all modes; None if some are unknown."""
     known = moments and all(moment.regions.size for moment in moments)
     every = [moment.regions.ravel() / _REGION for moment in moments]
     return _base64(_whole(np.concatenate(every))) if known else None
@@ -255,17 +256,17 @@ def _beliefs(moments: Sequence[Moment | None]) -> dict[str, Any]:
 
 
 def _identities(moments: Sequence[Moment | None]) -> list[list[int]] | None:
-    """Identities of the modes at each time; None: there are none."""
+    """Identities of the modes at each time; None if no mode has one."""
     result = [[] if one is None else one.identities.astype(int).tolist() for one in moments]
     return result if any(map(any, result)) else None
 
 
 def _bands(layer: Layer[Moment], stamps: Sequence[int]) -> dict[str, Any] | None:
-    """Intervals of 90 % over time, None where covariances are not known.
+    """Intervals of 90 % over time; None if covariances are unknown.
 
     Returns:
-        Names of `joints` and `angles`; `values`, `int16` (times, joints and angles, 3) of lower
-        end, middle and upper end: mm of heights, tenths of a degree of angles.
+        Names of `joints` and `angles`; `values`, `int16` (times, joints and angles, 3), lower end,
+        median and upper end of heights in mm, of angles in tenths of a degree.
     """
     names = [*layer.joint_names, *layer.angles]
     values = np.full((len(stamps), len(names), 3), np.nan)
@@ -278,7 +279,7 @@ def _bands(layer: Layer[Moment], stamps: Sequence[int]) -> dict[str, Any] | None
     if not joints or not known.any():
         return None
     values[:, :joints] *= 1e3
-    # Angles go on beyond a whole turn.
+    # Angles continue beyond a whole turn.
     middles = values[known, joints:, 1]
     values[known, joints:] += (np.unwrap(middles, axis=0, period=360.0) - middles)[..., None]
     values[:, joints:] *= 10.0
@@ -287,7 +288,7 @@ def _bands(layer: Layer[Moment], stamps: Sequence[int]) -> dict[str, Any] | None
 
 
 def _whole(values: Array) -> Array:
-    """Values as numbers of 16 bits; `_NOWHERE` for NaN."""
+    """Rounds values to the range of 16-bit integers; `_NOWHERE` represents NaN."""
     return np.where(np.isnan(values), _NOWHERE, np.clip(np.rint(values), -_LARGEST, _LARGEST))
 
 
@@ -356,7 +357,7 @@ def _detector(detector: Detector, content: Content, grid: _Grid) -> dict[str, An
 def _one_each(
     names: tuple[str, ...], joints: Mapping[int, Array], content: Content, grid: _Grid
 ) -> dict[str, Any]:
-    """One skeleton at each time for which it is known."""
+    """One skeleton for each time at which it is known."""
     known = [joints[stamp][None] for stamp in content.stamps if stamp in joints]
     positions = np.concatenate([np.zeros((0, len(names), 3)), *known])
     return {
@@ -367,7 +368,7 @@ def _one_each(
 
 
 def _true_heights(truth: Truth, content: Content) -> Array:
-    """Heights (T, J) of the true joints, m; NaN where they are unknown."""
+    """Heights (T, J) of the true joints, m; NaN if unknown."""
     result = np.full((len(content.stamps), len(truth.joint_names)), np.nan)
     for t, stamp in enumerate(content.stamps):
         if stamp in truth.joints:

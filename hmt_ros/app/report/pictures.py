@@ -52,10 +52,10 @@ def draw_pictures(
 
     Args:
         folder: folder of the pictures.
-        mixtures: mixtures of the bag; of those over poses the first layer is drawn.
-        images: images at the stamps of `shown_in_pictures`, as far as there are any.
+        mixtures: mixtures of the bag; the first layer of mixtures over poses is drawn.
+        images: images at the stamps of `shown_in_pictures`; some may be missing.
         truth: true joint positions; None if unknown.
-        scores: by topic; empty without truth.
+        scores: scores by topic; empty without truth.
 
     Returns:
         Names of the files, keys of `PICTURES`.
@@ -83,7 +83,7 @@ def draw_pictures(
 
 
 def _draw_weights(path: Path, track: Layer[Moment], truth: Truth | None) -> None:
-    """Weights of the modes over time and, with a truth, errors."""
+    """Draws the weights of the modes over time and, if the truth is known, errors."""
     moments = list(track.mixtures.values())
     seconds = np.array([(stamp - moments[0].stamp_ns) * 1e-9 for stamp in track.mixtures])
     most = max(len(moment.weights) for moment in moments)
@@ -126,7 +126,7 @@ def _draw_errors(axes: Any, track: Layer[Moment], truth: Truth, seconds: Array) 
 
 
 def _draw_calibration(path: Path, scores: dict[str, TrackScores]) -> None:
-    """Coverage of the highest-density regions over their probability."""
+    """Draws the coverage of the highest-density regions over their probability."""
     with new_picture(path, (10.4, 4.8), 'constrained') as figure:
         axes: Any = figure.subplots(1, 3, sharey=True)
         for number, (name, topic) in enumerate(scores.items()):
@@ -148,7 +148,7 @@ def _draw_calibration(path: Path, scores: dict[str, TrackScores]) -> None:
 
 
 def _draw_free_energy(path: Path, layers: Sequence[Layer[Window]]) -> None:
-    """Free energy of each window in the first and in the last iteration."""
+    """Draws the free energy of each window in the first and in the last iteration."""
     start = min(min(layer.mixtures) for layer in layers)
     with new_picture(path, (9.0, 2.8), 'constrained') as figure:
         axes: Any = figure.subplots()

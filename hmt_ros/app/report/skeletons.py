@@ -1,7 +1,7 @@
 """Skeletons of the modes: on the images that they explain, and from the side.
 
-Left limbs are orange and right limbs blue, which colour-blind people can tell apart; the fainter a
-mode, the smaller its weight.
+Left limbs are orange and right limbs blue, which colour-blind people can distinguish; modes of
+smaller weight are fainter.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from hmt_ros.inference.arrays import Array, Image
 
 Track = Layer[Moment]
 
-# Okabe and Ito's palette.
+# Colours from the palette of Okabe and Ito.
 LEFT, RIGHT, TRUNK, TRUTH = '#e69f00', '#0072b2', '#666666', '#000000'
 LIMBS = ('hip', 'knee', 'ankle', 'toe'), ('shoulder', 'elbow', 'wrist', 'hand')
 BONES = (
@@ -44,7 +44,7 @@ BONES = (
         )
     ),
 )
-# The trunk of a skeleton that has no pelvis.
+# Bones of the trunk of a skeleton without a pelvis.
 _TRUNK_OF_HIPS = ((*HIPS, TRUNK), *(('neck', hip, TRUNK) for hip in HIPS))
 STYLE: Any = {
     'font.size': 9.0,
@@ -53,14 +53,14 @@ STYLE: Any = {
     'axes.titlesize': 9.0,
     'savefig.facecolor': 'white',
 }
-# Number of modes on an image: more would hide it.
+# Maximum number of modes on an image, because more would hide it.
 ON_IMAGE = 3
 FAINTEST = 0.12
 _DASHED: Any = (0, (2, 1.2))
 
 
 def bones_of(names: Sequence[str]) -> list[tuple[int, int, str]]:
-    """Indices of the two joints, and colour, of each bone between joints of some names."""
+    """Indices of the two joints and colour of each bone between the named joints."""
     bones = BONES if ORIGIN in names else (*BONES, *_TRUNK_OF_HIPS)
     return [(names.index(a), names.index(b), c) for a, b, c in bones if {a, b} <= set(names)]
 
@@ -72,14 +72,14 @@ def draw_overview(
     images: dict[int, Image],
     truth: Truth | None,
 ) -> None:
-    """Images with the heaviest modes, and under each the same person from the side, all modes.
+    """Draws the heaviest modes on images and, below each image, all modes from the side.
 
     Args:
         path: path of the PNG file.
-        track: mixtures, of which those with an image are drawn.
+        track: mixtures; only those with an image are drawn.
         camera: camera of the images.
         images: images by stamp.
-        truth: true joint positions, which are drawn from the side; None if unknown.
+        truth: true joint positions, drawn from the side; None if unknown.
     """
     moments = _with_images(track, images)
     box = _crop(moments, camera)
@@ -114,7 +114,7 @@ def draw_overview(
 
 
 def draw_overlays(path: Path, track: Track, camera: Camera, images: dict[int, Image]) -> None:
-    """A sheet of images with the heaviest modes on them."""
+    """Draws a sheet of images with the heaviest modes."""
     moments = _with_images(track, images)
     box = _crop(moments, camera)
 
@@ -127,7 +127,7 @@ def draw_overlays(path: Path, track: Track, camera: Camera, images: dict[int, Im
 
 
 def draw_side_views(path: Path, track: Track, stamps: Sequence[int], truth: Truth | None) -> None:
-    """A sheet of the person from the side at some times, all modes."""
+    """Draws a sheet of all modes from the side at some times."""
     moments = list(track.at(stamps).mixtures.values())
     view = _SideView(track, moments, truth)
     title = 'all modes from the side; horizontal axis: towards the camera, m'
@@ -136,7 +136,7 @@ def draw_side_views(path: Path, track: Track, stamps: Sequence[int], truth: Trut
 
 @contextmanager
 def new_picture(path: Path, size: tuple[float, float], layout: Any = None) -> Iterator[Figure]:
-    """A figure in the style of the report, which `save_picture` writes at the end.
+    """Yields a figure in the style of the report, and saves it at the end.
 
     Args:
         size: width and height, inches.
@@ -148,7 +148,7 @@ def new_picture(path: Path, size: tuple[float, float], layout: Any = None) -> It
 
 
 def save_picture(figure: Figure, path: Path) -> None:
-    """Writes a PNG of 256 colours, a third of the size of one of all colours."""
+    """Writes a PNG of 256 colours, which is a third of the size of a PNG of all colours."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     pixels = np.asarray(canvas.buffer_rgba())[..., :3]
@@ -215,7 +215,7 @@ def _draw_on_image(
 
 
 class _SideView:
-    """The person from the side, towards the camera and up from the origin, m, on one scale."""
+    """A side view on one scale: axes towards the camera and up from the origin, m."""
 
     def __init__(self, track: Track, moments: Sequence[Moment], truth: Truth | None) -> None:
         self._names, self._truth = track.joint_names, truth

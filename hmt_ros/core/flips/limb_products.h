@@ -28,7 +28,7 @@ struct Limbs {
   Array<const bool, 3> sides;
   Array<const Index, 2> joint_segments;  // (C, J)
   Tables joint_offsets;                  // (C, J, 3)
-  Places siblings;                       // (C,) the limb of the other side; -1: there is none
+  Places siblings;                       // (C,) the limb of the other side; -1: none
 
   Index size() const { return links.size(); }
   Index width() const { return own.size(1); }
@@ -515,7 +515,7 @@ class Combiner {
   Scratch<Index, 2> taken_{count_, limit_};
   LeastSums least_sums_{limit_, most_, count_};
 
-  // The mode whose next product is the best; -1: there are none.
+  // The mode whose next product is the best; -1 if there is none.
   Index best_mode(Index modes) const {
     Index best = -1;
     for (Index g = 0; g < modes; ++g) {

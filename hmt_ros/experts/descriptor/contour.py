@@ -5,7 +5,7 @@ subtraction. One blob is taken as the person, together with the pieces that belo
 blobs are counted so that callers can report them. The sides at which the border of the image cuts
 the person are marked.
 
-The silhouette seen by a camera without distortion that looks straight at the person.
+`centred_view` is the silhouette in a camera without distortion that looks straight at the person.
 
 Towards the border of an image, most of all with a wide lens, a person is stretched and leans. Seen
 along the optical axis, one posture looks the same wherever it is, as its target does
@@ -33,10 +33,10 @@ SMALLEST = 60  # minimum area of a person, px
 # fills.
 LONGEST = 5.0
 FULLEST = 0.93
-# A piece belongs to the person below this share of the area and this gap in shares of the height.
+# Maximum area of a piece of the person over the person's area; maximum gap over the height.
 PIECE = 0.35
 GAP = 0.12
-NOTABLE = 0.02  # share of the person's area from which a blob left out is reported
+NOTABLE = 0.02  # share of the person's area above which a left-out blob is reported
 SMALLEST_HOLE = 0.004  # share of the area below which a hole is noise
 SMOOTHING = 5  # points of an outline that are averaged, which removes the steps of the raster
 SIDES = ('left', 'top', 'right', 'bottom')
@@ -44,7 +44,7 @@ SIDES = ('left', 'top', 'right', 'bottom')
 SIDE = 192  # px, of the view
 FILLED = 0.8  # share of the view that the longer side of the person fills, roughly
 UPRIGHT = np.eye(3)
-STRAIGHT = np.radians(2.0)  # angle to the axis below which a rotation moves nothing by a pixel
+STRAIGHT = np.radians(2.0)  # angle to the axis below which a rotation is below a pixel
 
 
 class NoSilhouetteError(ValueError):
@@ -94,7 +94,7 @@ def person_blob(mask: ArrayLike) -> PersonBlob:
     """The largest blob of a mask that looks like a person, with the pieces that belong to it.
 
     Args:
-        mask: (H, W), not zero in the foreground.
+        mask: (H, W) nonzero in the foreground.
 
     Raises:
         NoSilhouetteError: the mask is empty or has only specks.
@@ -207,12 +207,12 @@ def centred_view(
 
     Args:
         blob: the person.
-        camera: that saw it.
+        camera: camera of the mask.
         level: (3, 3) rotation about the optical axis from an upright camera's axes to its own.
         grey: (H, W) grey levels of the camera's image, or None.
 
     Returns:
-        The person, and the grey levels (h, w) seen so, or None.
+        The person, and the grey levels (h, w) in this view, or None.
     """
     if grey is not None:
         height, width = blob.mask.shape

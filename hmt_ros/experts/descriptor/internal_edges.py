@@ -1,11 +1,11 @@
-"""Edges inside a silhouette: faces, arms before the trunk, legs that cross (BME 3).
+"""Edges inside a silhouette: faces, arms in front of the trunk, crossed legs (BME 3).
 
     h(cell, angle, s) = sum |grad (G_s * I)| s / contrast     over pixels inside the eroded mask
 
-on a grid about the centroid, by the angle of the edge without its sign, at scales s above those of
-patterns of cloth. The image is smoothed over pixels of the person alone, so that the outline leaves
-no edge; contrast is the range of the person's grey levels. An outline does not show whether
-somebody faces the camera, and on which side of the trunk an arm lies; edges inside it do.
+on a grid about the centroid, by the unsigned angle of the edge, at scales s above those of cloth
+patterns. Smoothing uses pixels of the person only, so that the outline makes no edge;
+contrast is the range of the person's grey levels. An outline does not show whether somebody faces
+the camera, and on which side of the trunk an arm lies; edges inside it do.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ CELLS, ANGLES = 8, 4
 # Standard deviations of the smoothing, px of a person of 128 px.
 SCALES = (1.5, 3.0)
 EDGES = len(SCALES) * CELLS * CELLS * ANGLES
-# Distance to the outline from which a pixel counts, px.
+# Minimum distance of a pixel to the outline, px.
 ERODED = 3.0
-# Least range of grey levels, from the tenth to the ninetieth in a hundred.
+# Minimum range of grey levels, from the 10th to the 90th percentile.
 LEAST_CONTRAST = 20.0
 
 

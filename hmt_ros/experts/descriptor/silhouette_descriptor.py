@@ -1,13 +1,13 @@
 """The descriptor of a silhouette: the vector from which a pose is predicted (BME 3).
 
-Five descriptions of one person, brought to one size first:
+It has five descriptions of the person, who is first resized to a standard size:
 
 - the histogram of shape contexts over a codebook: which local shapes occur;
 - the histogram of edge pairs across the inside: how thick and how bent limbs are;
 - a map of the signed distance to the outline: where limbs are;
 - moments and proportions of the whole;
-- edges inside, where there is an image (`internal_edges`). Without one they are unknown, and the
-  descriptor has their mean in their place.
+- edges inside, if there is an image (`internal_edges`). Without an image the descriptor uses their
+  mean.
 
 None of them changes with the position and the size of the person in the image. Edge pairs do not
 change with rotation either; the others do, because a camera stands upright and up has a meaning. A
@@ -48,7 +48,7 @@ Bytes = NDArray[np.uint8]
 RADIAL, ANGULAR = 5, 12
 RADII = (1 / 8, 3.0)  # of the mean distance between points
 VOTES = 4  # centres that a context votes for
-LEAST_DISTANCE = 1e-3  # a context that is nearer to a centre votes as if it were this far away
+LEAST_DISTANCE = 1e-3  # minimum distance of a context from a centre in its votes
 
 PAIR_DISTANCES, PAIR_ANGLES = 6, 8
 PAIR_BINS = PAIR_DISTANCES * PAIR_ANGLES
@@ -146,7 +146,7 @@ def _pairs(count: int) -> tuple[Index, Index]:
     return first, second
 
 
-SIZE = 128  # longer side of the person before anything is measured, px
+SIZE = 128  # longer side of the resized person, px
 MAP = 16  # cells of a side of the map of distances
 EXTENT = 4.4  # width of the map in radii of gyration; stretched arms and legs are inside
 DEEPEST, FURTHEST = 0.25, 0.60  # limits of the distances inside and outside, radii of gyration
@@ -177,10 +177,10 @@ class SilhouetteParts:
 def silhouette_parts(
     mask: ArrayLike, points: int = 100, grey: Bytes | None = None
 ) -> SilhouetteParts:
-    """The descriptions of the person in a mask (H, W).
+    """Compute the descriptions of the person in a mask (H, W).
 
     Args:
-        mask: (H, W), not zero in the foreground.
+        mask: (H, W) nonzero in the foreground.
         grey: (H, W) grey levels of the image; None: edges inside are unknown.
 
     Raises:
@@ -202,7 +202,7 @@ def silhouette_parts(
 
 @dataclass(frozen=True, eq=False)
 class SilhouetteDescriptor:
-    """Vectors of silhouettes, as `hmt_learning.training.descriptor_learning` has learned them.
+    """Descriptor learned by `hmt_learning.training.descriptor_learning`.
 
     Attributes:
         codebook: Codebook of shape contexts.
@@ -212,7 +212,7 @@ class SilhouetteDescriptor:
         points: Number of points on the outline.
 
     Raises:
-        ValueError: arrays that do not fit, or are not finite.
+        ValueError: arrays have wrong shapes or are not finite.
     """
 
     codebook: ShapeContextCodebook
@@ -281,7 +281,7 @@ def features_of(codebook: ShapeContextCodebook, parts: SilhouetteParts) -> dict[
 
 
 def _at_one_size(mask: Bytes) -> Bytes:
-    """The person, resized so that the longer side has SIZE pixels."""
+    """Resize the person so that the longer side has SIZE pixels."""
     factor = SIZE / max(mask.shape)
     height, width = (max(round(side * factor), 3) for side in mask.shape)
     resized = cv2.resize(mask * np.uint8(255), (width, height), interpolation=_interpolation(mask))
@@ -293,7 +293,7 @@ def _interpolation(mask: Bytes) -> int:
 
 
 def _interpolated(values: Array, rows: Array, columns: Array) -> Array:
-    """Values (h, w) between pixels, at rows (m,) and columns (n,) inside, bilinearly: (m, n)."""
+    """Interpolate values (h, w) bilinearly at rows (m,) and columns (n,); return (m, n)."""
     i = np.clip(np.floor(rows).astype(np.intp), 0, values.shape[0] - 2)
     j = np.clip(np.floor(columns).astype(np.intp), 0, values.shape[1] - 2)
     down, right = (rows - i)[:, None], columns - j
@@ -308,7 +308,7 @@ def _map_and_moments(mask: Bytes) -> tuple[Array, Array, tuple[float, float], fl
     x, y = m['m10'] / area, m['m01'] / area
     radius = np.sqrt((m['mu20'] + m['mu02']) / area)
     half = 0.5 * EXTENT * radius
-    # Room around the person for the whole map.
+    # Pad the mask to hold the whole map.
     height, width = mask.shape
     left, top = (max(int(half - at) + 2, 2) for at in (x, y))
     right, bottom = (max(int(at + half) - side + 3, 2) for at, side in ((x, width), (y, height)))

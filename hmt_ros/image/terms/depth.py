@@ -52,7 +52,7 @@ def usable_depths(depth: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def depth_map(window: ImageWindow) -> ImageMap | None:
-    """The depths of a window; None: nothing was measured there."""
+    """The depths of a window; None if nothing was measured there."""
     if window.depth is None:
         return None
     depths = usable_depths(window.depth)

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.inference.arrays import Array, Image
 
-# A mask that is not there, and a map.
+# An absent mask, and an absent map.
 NOTHING = np.zeros((0, 0), np.uint8)
 NO_MAP = ImageMap(np.zeros((2, 2, 2), np.float32))
-# Factors on the energies at segments, where all are 1.
+# Factors on the energies at segments if all are 1.
 NO_FACTORS = np.zeros(0)
 
 
@@ -58,11 +58,11 @@ class ImageWindow:
         image: (h, w, 3) BGR.
         left, top: column and row of its first pixel in the whole image.
         mask: (h, w) silhouette, 0 or 1; None: unknown.
-        unsure: (h, w) pixels that may belong to it, 0 or 1; None: there are none.
-        last_image: (h, w, 3) the same part of the image before; None: there is none.
-        others: (h, w) pixels that show or may show somebody else, 0 or 1: they neither speak for a
-            pose nor against it; None: there are none.
-        depth: (h, w) the same part of the depth image, m; None: there is none.
+        unsure: (h, w) pixels that may belong to it, 0 or 1; None if there are none.
+        last_image: (h, w, 3) the same part of the image before; None if there is none.
+        others: (h, w) pixels that show or may show somebody else, 0 or 1, and are evidence neither
+            for a pose nor against it; None if there are none.
+        depth: (h, w) the same part of the depth image, m; None if there is none.
     """
 
     image: Image
@@ -76,7 +76,7 @@ class ImageWindow:
 
     @property
     def widest(self) -> Image | None:
-        """The silhouette (h, w) with all that may belong to it, 0 or 1; None: unknown."""
+        """The silhouette (h, w) with all that may belong to it, 0 or 1; None if unknown."""
         widest = self.mask
         if widest is not None:
             for more in (self.unsure, self.others):
@@ -89,10 +89,10 @@ class ImageWindow:
 
 
 class Weighting(NamedTuple):
-    """`TermSettings` as compiled code reads them; weight 0: off.
+    """`TermSettings` as compiled code reads them; a weight of 0 switches the term off.
 
-    `magnification`, px for a metre at the person, turns errors of the body into pixels; `segments`
-    are factors (S,) on the energies at each segment, (0,): all are 1.
+    `magnification`, px/m at the person, converts errors of the body to pixels; `segments` are
+    factors (S,) on the energies at each segment, (0,) if all are 1.
     """
 
     weight: float
@@ -108,10 +108,10 @@ class ImageTerm:
     """One term of the image likelihood.
 
     Attributes:
-        name: of the term, of its settings and of its evidence.
-        meaning: quantities that it compares, which opens the descriptions of its parameters.
-        settings: defaults.
-        evidence: takes the evidence of the term from an image; None: the image lacks it.
+        name: name of the term, of its settings and of its evidence.
+        meaning: the quantities that it compares; the descriptions of its parameters begin with it.
+        settings: default settings.
+        evidence: takes the evidence of the term from an image; returns None if there is none.
         inputs: makes the inputs of the core: a NamedTuple that starts with the `Weighting`, read
             member by member into the struct of its header. Without evidence (None) it has weight 0
             and empty arrays of the same types.

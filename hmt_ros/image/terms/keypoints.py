@@ -6,7 +6,7 @@
 u_k,e projects the landmark that keypoint k shows, seen at p_k with covariance S_k (px^2) and noise
 s_k on the person (m, at the magnification m, px/m). Detectors take left for right: in the exchange
 e, of prior probability p_e, the keypoints of all limbs, of the arms or of the legs show the
-landmarks of the other side. Depths of a detector count by the slopes of bones.
+landmarks of the other side. Depths from a detector count through the slopes of bones.
 """
 
 from __future__ import annotations
@@ -43,20 +43,20 @@ from hmt_ros.inference.linear_algebra import cholesky, inverse
 KEYPOINTS = TermSettings(0.5, 1.0, 3.0)
 # Assumed height of the visible part of a person whose distance is unknown, m.
 USUAL_EXTENT = 1.4
-# Stature of a person whose landmarks have the offsets of the table, m.
+# Stature of the person that the landmark offsets of the table belong to, m.
 USUAL_STATURE = 1.7
-# Least standard deviation of a keypoint whose noise is learned, px.
+# Minimum standard deviation of a keypoint whose noise is learned, px.
 SMALLEST_SIGMA = 1.5
-# The share of a mixture over lifted poses that is independent, because joints err together; and the
-# scale of its kernel, in standard deviations: one limb, or all, may be elsewhere. Chosen, with the
-# time of `ERRORS['lifted']`.
+# Factor on the energy of a mixture over lifted poses, because errors of joints are correlated; and
+# scale of its kernel, in standard deviations, because one limb or all may be elsewhere. Both were
+# chosen together with the time of `ERRORS['lifted']`.
 LIFTED_WEIGHT, LIFTED_SCALE = 0.1, 3.0
-# Groups of landmarks that are exchanged together, and which of them (E, G) an exchange exchanges:
-# nothing, all, arms, legs.
+# Groups of landmarks that change sides together, and the groups (E, G) that do so in each exchange:
+# none, all, the arms, the legs.
 CENTRE, ARMS, LEGS = range(3)
 EXCHANGED = np.array([[0, 0, 0], [1, 1, 1], [0, 1, 0], [0, 0, 1]], dtype=np.int64)
 
-# (1, E) log probabilities of exchanges of keypoints that are known to be called by their sides.
+# (1, E) log probabilities of the exchanges of keypoints whose sides are known to be right.
 NOT_EXCHANGED = np.array([[0.0, -np.inf, -np.inf, -np.inf]])
 
 
@@ -65,21 +65,21 @@ class Keypoints:
     """Image positions of joints, from any 2D detector or by hand.
 
     Attributes:
-        names: (n,) joints of the body; of a detector, before `named_for`, its landmarks.
+        names: (n,) joints of the body; before `named_for`, landmarks of the detector.
         pixels: (n, 2) column and row, px; NaN where a joint was not seen.
-        covariances: (n, 2, 2) px^2; NaN before `named_for`: unknown.
-        confidences: (n,) from 0, ignore, to 1, sure.
-        positions: (n, 3) of a detector that lifts, m, along the axes of the camera from an origin
-            that all share; NaN where there is none. None: it does not lift.
+        covariances: (n, 2, 2) px^2; NaN where unknown, before `named_for` only.
+        confidences: (n,) from 0 (ignored) to 1 (sure).
+        positions: (n, 3) from a detector that lifts, m, along the axes of the camera from a common
+            origin; NaN where unknown. None if the detector does not lift.
         landmarks: (n,) canonical names of landmarks (`keypoint_schemes`), '' for joints; None:
             all names are those of joints.
-        scheme: of the detector, once it is known.
+        scheme: keypoint scheme of the detector, once it is known.
         lifted: mixture over whole poses from keypoints or positions; only its depths count, because
             across the line of sight the keypoints themselves are the evidence.
         offsets: (n, 3) of the landmarks from the joint in the frame of its segment, m; None: joints
             were seen.
-        noise: (n,) standard deviation beside the covariances, m on the person; it accounts for the
-            confidences. None: none, and confidences divide the precisions.
+        noise: (n,) standard deviations in addition to the covariances, m on the person; they
+            account for the confidences. None: confidences are factors on the precisions.
     """
 
     names: tuple[str, ...]
@@ -105,12 +105,12 @@ class Keypoints:
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
-        """(n,) joints that have a position and are not to be ignored."""
+        """(n,) whether a keypoint has a position and a confidence above 0."""
         return np.asarray(np.isfinite(self.pixels).all(1) & (self.confidences > 0), dtype=np.bool_)
 
     @property
     def trunk(self) -> Array:
-        """(2,) from the middle of the hips to that of the shoulders, px; NaN: not all are seen."""
+        """Vector (2,) from mid-hips to mid-shoulders, px; NaN unless all four are seen."""
         places = dict(zip(self.names, np.where(self.seen[:, None], self.pixels, np.nan)))
         unknown = np.full(2, np.nan)
         middles = [
@@ -120,7 +120,7 @@ class Keypoints:
         return np.asarray(0.5 * (middles[0] - middles[1]))
 
     def __getitem__(self, which: Index) -> Keypoints:
-        """Some of them."""
+        """The keypoints with these indices."""
         more = {
             name: None if getattr(self, name) is None else getattr(self, name)[which]
             for name in ('positions', 'offsets', 'noise')
@@ -138,13 +138,13 @@ class Keypoints:
         )
 
     def named_for(self, body: Body, scheme: str = 'auto') -> tuple[Keypoints, list[str]]:
-        """Keypoints at joints of a body, under the body's names, and the names of the others.
+        """Keypoints at joints of a body, under the body's names, and the names that the body lacks.
 
-        Unknown covariances become those that are learned for keypoints of a scheme.
+        Unknown covariances are replaced by the learned noise of the scheme.
 
         Args:
-            scheme: of the names, see `keypoint_schemes`; 'auto': the one that has them all,
-                'joints': none, they are names of joints.
+            scheme: scheme of the names, see `keypoint_schemes`; 'auto' selects one that has them
+                all, 'joints' means that they are names of joints.
 
         Raises:
             ValueError: there is no such scheme.
@@ -188,7 +188,7 @@ class Keypoints:
         return renamed, strange
 
     def magnification(self) -> float:
-        """Approximate px of a metre at the person, by the extent of the keypoints."""
+        """Approximate magnification at the person, px/m, from the extent of the keypoints."""
         seen = self.pixels[self.seen]
         if len(seen) < 2:
             return 1.0
@@ -196,14 +196,14 @@ class Keypoints:
 
 
 class Points(NamedTuple):
-    """Keypoints (P,), each with its landmark, and its landmark if sides are exchanged.
+    """P keypoints, each with its landmark as named and its landmark with exchanged sides.
 
     Attributes:
-        segments: (P, 2) that carry the landmarks.
+        segments: (P, 2) segments that carry the landmarks.
         offsets: (P, 2, 3) of the landmarks in the frames of the segments, m.
         pixels: (P, 2).
         whiteners: (P, 2, 2) W, W' W is the precision.
-        groups: (P,) that are exchanged together.
+        groups: (P,) group that each changes sides with.
     """
 
     segments: Index
@@ -217,15 +217,15 @@ class Lifted(NamedTuple):
     """Depths of joints (J,) behind the middle of the hips, a mixture of C components.
 
     Attributes:
-        segments: (J,) that carry the joints.
+        segments: (J,) segments that carry the joints.
         offsets: (J, 3) of the joints in the frames of the segments, m.
         middle: (3,) middle of the hips in the frame of the root, m.
         ray: (3,) line of sight, unit vector.
-        log_weights: (C,) with the normalisers of the components.
-        depths: (2, C, J) along the ray from the middle of the hips, m, as the sides are called and
-            exchanged.
-        precisions: (2, C, J) square roots, 1/m.
-        readings: (E,) 0 or 1: how an exchange of sides reads the mixture.
+        log_weights: (C,) including the normalisers of the components.
+        depths: (2, C, J) means along the ray from the middle of the hips, m, with sides as named
+            and exchanged.
+        precisions: (2, C, J) square roots of the precisions, 1/m.
+        readings: (E,) row of `depths`, 0 or 1, that applies in each exchange of sides.
         weight: factor on the energy; 0 without a mixture.
         scale: of the kernel, in standard deviations; it bounds the energy of a joint.
     """
@@ -246,14 +246,14 @@ class KeypointInputs(NamedTuple):
     """Inputs of the energy of keypoints.
 
     Attributes:
-        points: that were measured.
+        points: the measured keypoints.
         lifted: the mixture over whole poses.
         tree, lens: skeleton and camera.
         scale: of the kernel, in standard deviations.
         weights: (G,) factors on the energies of the groups.
-        factors: (S,) on those of keypoints of each segment, as they are called; (0,): all are 1.
-        exchanged: (E, G) 1 where an exchange exchanges a group.
-        log_priors: (R, E) of the exchanges, a row a problem or one for all.
+        factors: (S,) on the energies of keypoints of each segment as named; (0,) if all are 1.
+        exchanged: (E, G) 1 where a group changes sides in an exchange.
+        log_priors: (R, E) of the exchanges, one row per problem or one for all.
     """
 
     points: Points
@@ -275,19 +275,19 @@ class KeypointTerm:
 
     Attributes:
         skeleton, camera: the person, and the camera that sees the person.
-        keypoints: that were seen.
-        settings: weight w, factor on the standard deviations, and scale of the kernel; inf: least
-            squares.
-        magnification: px for a metre at the person; 0: unknown.
-        exchanges: (R, E) log probability of each exchange before the image, a row for each problem
-            or one for all; None: nothing is exchanged.
-        beliefs: (G,) factors on the energies of the groups of landmarks; None: 1.
+        keypoints: the detected ones.
+        settings: weight w, factor on the standard deviations, and scale of the kernel; an
+            infinite scale gives least squares.
+        magnification: px/m at the person; 0 if unknown.
+        exchanges: (R, E) log probability of each exchange before the image, one row per problem
+            or one for all; None if sides are never exchanged.
+        beliefs: (G,) factors on the energies of the groups of landmarks; None if all are 1.
         lifted_share: factor on the energy of the mixture over whole poses.
-        segments: (S,) factors on the energies of keypoints of each segment, as they are called;
-            (0,) or None: 1.
+        segments: (S,) factors on the energies of keypoints of each segment as named; (0,) or None
+            if all are 1.
 
     Raises:
-        KeyError: a keypoint that is not a joint of the body.
+        KeyError: a keypoint is not at a joint of the body.
     """
 
     skeleton: Skeleton
@@ -326,23 +326,25 @@ class KeypointTerm:
         return result
 
     def residuals(self, frames: Frames) -> tuple[Index, Array, Array, Array, Array]:
-        """The residuals at the frames of one pose, in the exchange that is likeliest there.
+        """The residuals at the frames of one pose, in the likeliest exchange.
 
         Returns:
             (M,) joint of the skeleton, (M, 3) position of the landmark, (M, 3) derivative of the
-            residual by the position, (M,) derivative and (M,) curvature of the energy by the
-            residual; two residuals a keypoint. Landmarks behind the camera have none.
+            residual with respect to the position, (M,) derivative and (M,) curvature of the energy
+            with respect to the residual; two residuals per keypoint. Landmarks behind the camera
+            have none.
         """
         (found,) = self.recorded(frames)
         rows = found[1 : 1 + int(found[0, 0])]
         return rows[:, 0].astype(np.intp), rows[:, 1:4], rows[:, 4:7], rows[:, 7], rows[:, 8]
 
     def recorded(self, frames: Frames) -> Array:
-        """The residuals at the frames of N poses, as `residuals` of one; see `record_keypoints`.
+        """The residuals at the frames of N poses; see `residuals` and `record_keypoints`.
 
         Returns:
             (N, 1 + M, RECORDED): rows 1 to m of a pose are joint, position, derivative of the
-            residual by it, derivative and curvature of the energy; m is the first number of row 0.
+            residual with respect to it, derivative and curvature of the energy; m is the
+            first number of row 0.
         """
         measured = self.measured
         result = np.zeros((frames.count, 1 + 2 * len(measured.joints), RECORDED))
@@ -350,9 +352,9 @@ class KeypointTerm:
         return result
 
     def distances(self, frames: Frames) -> Array:
-        """How far the P keypoints that were seen are from N poses, (N, P), in deviations.
+        """Distances (N, P) of the P seen keypoints from N poses, in standard deviations.
 
-        The exchange of sides is the likeliest; of a landmark behind the camera it is NaN.
+        They are those of the likeliest exchange of sides; NaN for landmarks behind the camera.
         """
         errors = np.empty((frames.count, len(self.measured.joints), 2))
         keypoint_errors(self.compiled, *frames.by_pose(), errors)
@@ -376,7 +378,7 @@ class MeasuredKeypoints:
     """P keypoints that count, as inputs of the kernel, the same for all poses of a skeleton.
 
     Attributes:
-        joints: (P, 2) of the skeleton that they show, as they are called and exchanged.
+        joints: (P, 2) joints of the skeleton that they show, with sides as named and exchanged.
         points: where they were seen, and on which segment they lie.
         lifted: the mixture over whole poses.
     """
@@ -386,8 +388,8 @@ class MeasuredKeypoints:
     lifted: Lifted
 
 
-# A track makes a term for every set of hypotheses of an image, and a start one for every trial of
-# lengths. Inputs that do not depend on the hypotheses, or on the lengths, are computed once.
+# A track makes a term for every set of hypotheses of an image, and a start makes one for every
+# trial of lengths. Inputs that depend on neither the hypotheses nor the lengths are computed once.
 @lru_cache(maxsize=16)
 def _measured(
     skeleton: Skeleton, keypoints: Keypoints, sigma: float, magnification: float
@@ -406,7 +408,7 @@ def _measured(
 
 @lru_cache(maxsize=16)
 def _whitened(keypoints: Keypoints, sigma: float, magnification: float) -> tuple[Keypoints, Array]:
-    """The keypoints that count, and matrices (P, 2, 2) that make their noise white."""
+    """The keypoints that count, and matrices (P, 2, 2) that whiten their noise."""
     k = keypoints[np.flatnonzero(keypoints.seen)]
     covariances = sigma**2 * k.covariances
     confidences = k.confidences[:, None, None]
@@ -459,7 +461,7 @@ def _lifted(skeleton: Skeleton, poses: LiftedPoses | None, sigma: float) -> Lift
 
 @lru_cache(maxsize=16)
 def groups_of(skeleton: Skeleton) -> Index:
-    """Groups (S,) that landmarks on the segments are exchanged with."""
+    """Group (S,) that landmarks on each segment change sides with."""
     result = np.full(len(skeleton.parents), CENTRE, dtype=np.int64)
     for chain, segments in skeleton.chains.items():
         result[list(segments)] = {'arm': ARMS, 'leg': LEGS}.get(chain.rpartition('_')[2], CENTRE)

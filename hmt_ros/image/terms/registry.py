@@ -29,7 +29,7 @@ class Model(NamedTuple):
         tree, flesh, lens: skeleton, parts and rings, camera.
         traced: (B,) parts whose contour is compared with the image.
         occluders: (B,) parts that can hide others.
-        contour_points: number of contour points that the weights are for; 0: those there are.
+        contour_points: number of contour points that the weights refer to; 0: those that exist.
     """
 
     tree: Tree

@@ -24,9 +24,9 @@ from hmt_ros.image.terms.image_term import (
 )
 from hmt_ros.inference.arrays import Array
 
-# Samples on the outline.
+# Approximate number of samples on the outline.
 OUTLINE_POINTS = 120
-# Pixels of the shortest outline that counts.
+# Minimum length of an outline that counts, px.
 SHORTEST = 12
 
 
@@ -50,8 +50,8 @@ class CoverageInputs(NamedTuple):
     Attributes:
         term: weighting.
         outline: samples.
-        explained: (X, M) maximum energy of samples; a row a pose, or one row for all.
-        costs: (N, M) result: energy of each sample; (0, M): it is not wanted.
+        explained: (X, M) maximum energy of samples; one row per pose, or one for all.
+        costs: (N, M) result: energy of each sample; (0, M) if it is not wanted.
     """
 
     term: Weighting

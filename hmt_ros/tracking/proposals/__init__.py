@@ -1,4 +1,4 @@
-"""Propose: where hypotheses come from (KJS 3 and 5). Each proposal is a function of its own."""
+"""Propose: the sources of hypotheses (KJS 3 and 5). Each proposal is a function."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from hmt_ros.tracking.proposals.whole_poses import predicted_poses, reversed_pos
 
 
 class Proposal(Protocol):
-    """Something that proposes hypotheses for an image."""
+    """A function that proposes hypotheses for an image."""
 
     def __call__(
         self, search: Search, sources: Hypotheses, rng: np.random.Generator, /
     ) -> Hypotheses:
-        """Hypotheses that are to be optimised, if any; a proposal does not set their weights.
+        """Proposes hypotheses to optimise, if any, without setting their weights.
 
         Args:
             search: of the image.
-            sources: the hypotheses that its base was optimised from.
+            sources: starting points of the optima `search.base`.
             rng: source of randomness.
         """
         ...
 
 
-# Of every tracker, before the one that the setting `proposals` selects by its name. Each decides by
-# itself whether it applies to an image. A new proposal is a file beside this one and a name here.
+# Proposals of every tracker, before the one that the setting `proposals` selects. Each decides
+# whether it applies to an image. To add a proposal, add a file beside this one and a name here.
 USUAL: tuple[Proposal, ...] = (predicted_poses, reversed_poses)
 SELECTED: Mapping[str, Proposal] = MappingProxyType(
     {'kjs': jumped_poses, 'css': covariance_scaled_poses, 'ss': spherical_poses}
@@ -43,7 +43,7 @@ def proposals_of(selected: str) -> tuple[Proposal, ...]:
     """The proposals of a tracker, by its setting.
 
     Raises:
-        ValueError: another name.
+        ValueError: an unknown name.
     """
     if selected not in SELECTED:
         raise ValueError(f'proposals must be one of {tuple(SELECTED)}, saw {selected!r}')

@@ -1,17 +1,17 @@
 """Kinematic jump sampling: other configurations of the limbs and of the trunk (KJS 3, 4).
 
-For each trunk that the modes have, every limb has alternatives: those of the modes, all their
-flips, and, where no keypoints show it or the image is surprising, the results of an image search.
-Combinations of alternatives are rated on the trunk as it is, with limbs exchanged that were taken
-for each other, and with the torso flipped; the best that stand for all become candidates.
+For each distinct trunk among the modes, every limb has alternatives: those of the modes, all their
+flips, and, if no keypoints show it or the image is surprising, the results of an image search.
+Combinations of alternatives are rated on the unchanged trunk, with confused limbs exchanged, and
+with the torso flipped; the best representatives become candidates.
 
 Covariance-scaled sampling of one limb at a time (KJS 3).
 
     E(a) = E_image(a) + E_keypoints(a) + E_prior(a) + E_motion(a)      over the angles a of a limb
 
-Given the trunk, limbs are nearly independent: instead of 37 degrees of freedom at once, samples of
-the four to six of one limb are compared with the image there, and the best are refined. The part of
-the silhouette's outline that the rest of the body explains costs a limb nothing.
+Given the trunk, limbs are nearly independent: instead of all 37 degrees of freedom, the four to six
+of one limb are sampled and compared with the image there, and the best samples are refined. The
+part of the silhouette's outline that the rest of the body explains costs a limb nothing.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from hmt_ros.tracking.settings import (
     EvaluationPlan,
 )
 
-# A variable that changes less has not jumped.
+# Smallest change of a variable that is a jump, rad or m.
 STILL = float(np.sqrt(np.finfo(np.float64).eps))
 
 
@@ -54,13 +54,13 @@ def find_limb(
     plan: EvaluationPlan,
     rng: np.random.Generator,
 ) -> Array:
-    """Angles (A, chain dofs) of a limb that fit the image, distinct from each other or not.
+    """Angles (A, chain dofs) of a limb that fit the image, not necessarily distinct.
 
     Args:
         posterior: of the body before the camera.
         chain: name of the limb.
-        pose: (d,) whose other limbs are kept.
-        covariance: (d, d) how far the limb may have moved.
+        pose: (d,) with the other limbs, which stay fixed.
+        covariance: (d, d) of the predicted pose.
         observation: of the image.
         plan: allocation of its evaluations.
         rng: source of randomness.
@@ -91,7 +91,7 @@ def _drawn(
     n: int,
     rng: np.random.Generator,
 ) -> Array:
-    """N samples from the mode, from it stretched, and from the body's prior: a third each."""
+    """N samples: a third each from the mode, the stretched mode and the body's prior."""
     noise = standard_normals(rng, (n, len(own)))
     near: Array = product(noise, cholesky(block).T)
     near[n // 3 :] *= stretch
@@ -103,7 +103,7 @@ def _drawn(
 
 
 def jumped_poses(search: Search, sources: Hypotheses, rng: np.random.Generator) -> Hypotheses:
-    """Poses far from those that are known, which fit the image as well."""
+    """Hypotheses at combinations of limb and trunk configurations that fit the image."""
     posterior, observation, plan = search.posterior, search.observation, search.plan
     base, body = search.base, posterior.body
     limbs = limbs_not_shown(posterior, observation, plan.surprising)
@@ -144,13 +144,13 @@ def jumped_poses(search: Search, sources: Hypotheses, rng: np.random.Generator) 
     poses, members, energies = (np.concatenate(parts) for parts in zip(*everything, strict=True))
     kept = search.best(poses, energies)
     poses, members = poses[kept], members[kept]
-    # A chain that jumped is expected where it landed, the rest where it was predicted.
+    # The motion prior of a chain that jumped is centred at its new place, else at the prediction.
     jumped = np.abs(poses - base.x[members]) > STILL
     return sources.proposed(members, poses, jumped)
 
 
 def _groups(search: Search) -> list[Index]:
-    """Modes with nearly the same trunk, each group with its best mode first."""
+    """Groups of modes with nearly the same trunk, the best mode of each first."""
     skeleton = search.posterior.body.skeleton
     trunk = search.base_joints[:, skeleton.joint_index(skeleton.trunk_joints)]
     left = np.argsort(search.base.value, kind='stable')
@@ -164,10 +164,10 @@ def _groups(search: Search) -> list[Index]:
 
 
 def limbs_not_shown(posterior: Posterior, observation: Observation, surprising: bool) -> list[str]:
-    """The limbs that an image is searched for: those that no keypoints show.
+    """The limbs to search for in an image: those that no keypoints show.
 
-    Two keypoints fix a limb but for its flips; samples beside them mostly find other limbs and
-    the background. Where an image is surprising the keypoints may be wrong.
+    Two keypoints fix a limb up to its flips; samples away from them mostly find other limbs and
+    the background. In a surprising image the keypoints may be wrong.
     """
     if not {'coverage', 'edges'} & observation.evidence.keys():
         return []
@@ -190,13 +190,13 @@ def limbs_not_shown(posterior: Posterior, observation: Observation, surprising: 
 def _search_limbs(
     limbs: list[str], search: Search, pose: Array, ancestor: int, rng: np.random.Generator
 ) -> dict[str, Array]:
-    """Configurations of some limbs that fit the image, where the others are as in a pose (d,).
+    """Configurations of randomly chosen limbs that fit the image; a pose (d,) fixes the others.
 
     Args:
-        limbs: that may be searched for.
+        limbs: candidates for the search.
         search: of the image.
         pose: (d,) the first of a group.
-        ancestor: of it.
+        ancestor: of that pose.
         rng: source of randomness.
     """
     count = min(search.plan.searched_chains, len(limbs))

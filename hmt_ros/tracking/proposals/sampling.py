@@ -22,7 +22,7 @@ from hmt_ros.tracking.optimisation import Search
 def spherical_samples(
     body: Body, means: Array, covariances: Array, count: int, scale: float, rng: np.random.Generator
 ) -> Array:
-    """Isotropic noise around each mean, of the volume that its covariance has; (K, count, d).
+    """Isotropic noise around each mean, with the volume of its covariance; (K, count, d).
 
     The radius is the geometric mean of the axes of the ellipsoid, |S|^(1/2d). Samples that leave
     the limits are projected back.
@@ -30,7 +30,7 @@ def spherical_samples(
     Args:
         body: with the limits.
         means, covariances: (K, d), (K, d, d).
-        count: samples a mean.
+        count: number of samples per mean.
         scale: factor on the radius; 0: Cauchy tails of scale 1.
         rng: source of randomness.
     """
@@ -44,7 +44,7 @@ def spherical_samples(
 def covariance_scaled_samples(
     body: Body, means: Array, covariances: Array, count: int, scale: float, rng: np.random.Generator
 ) -> Array:
-    """Noise with the covariance of each mean, stretched; (K, count, d). Arguments as above."""
+    """Noise with the scaled covariance of each mean, (K, count, d); see `spherical_samples`."""
     factors = cholesky(covariances)
     noise = _noise((len(means), count, means.shape[1]), scale, rng)
     samples: Array = np.clip(
@@ -80,7 +80,7 @@ def _sampled(
     sources: Hypotheses,
     rng: np.random.Generator,
 ) -> Hypotheses:
-    """The best of samples, and the optima that are there."""
+    """Representatives of the samples and the optima of the predictions."""
     posterior, k = search.posterior, len(sources)
     s, body = posterior.settings, posterior.body
     each = max(s.samples // k, 1)

@@ -1,20 +1,20 @@
-"""Whole poses to search from: predicted ones, by keypoints alone, and reversed ones.
+"""Whole poses to search from: predicted poses, poses by keypoints alone, and reversals.
 
 Pose hypotheses from an external single-image predictor, such as a mixture of experts, are
-proposals, no evidence, which would count the image twice.
+proposals and not evidence: that would count the image twice.
 
-Poses fitted to keypoints alone, from which a silhouette of something else draws modes away:
+Poses fitted to keypoints alone, for when a wrong silhouette draws the modes away from them:
 
     x' = argmin sum_p d_p(x)^2 / 2 + E_prior(x) + (x - f)' P (x - f) / 2
 
-d_p is the distance to keypoint p in deviations, f the predicted pose of the heaviest mode, or x' of
-the image before while silhouette and keypoints go different ways, P the precision of the
+d_p is the distance to keypoint p in standard deviations; f is the predicted pose of the heaviest
+mode, or x' of the previous image while silhouette and keypoints disagree; P is the precision of the
 prediction.
 
-Reversals are the whole pose the other way round in depth, left taken for right (`body.mirror`). A
-silhouette hardly tells a pose from its reversal, so a turn can be taken the wrong way round, and no
-jump of a limb leads back. Where no mode of comparable weight faces one of the two ways, the best
-mode is reversed.
+A reversal is the whole pose reversed in depth, with left and right exchanged (`body.mirror`). A
+silhouette hardly distinguishes a pose from its reversal, so a track may follow a turn the wrong way
+round, and no jump of a limb corrects that. If no mode of comparable weight faces one of the two
+ways, the best mode is reversed.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from hmt_ros.tracking.validity import UNDECIDED, ByKeypoints
 
 
 class PoseByKeypoints:
-    """The pose that keypoints alone have led to since the modes left some of them.
+    """The pose by keypoints alone, followed while the modes miss some of them.
 
     Attributes:
-        pose: (1, d) of the last image; None: the modes explain every group of keypoints.
+        pose: (1, d) in the last image; None: the modes explain every group of keypoints.
     """
 
     def __init__(self) -> None:
@@ -49,16 +49,16 @@ class PoseByKeypoints:
     def follow(
         self, search: Search, mode: Array, term: KeypointTerm, missed: Misfit
     ) -> ByKeypoints | None:
-        """Goes on to the keypoints of an image.
+        """Updates the pose by the keypoints of an image.
 
         Args:
             search: of the image.
             mode: (d,) the heaviest.
             term: of the keypoints.
-            missed: misfit of the modes to them.
+            missed: misfit of the modes to the keypoints.
 
         Returns:
-            Misfit and gain of the pose by keypoints; None: the modes explain enough keypoints.
+            Misfit and gain of the pose by keypoints; None if the modes explain enough keypoints.
         """
         if not _misses_a_group(missed):
             self.pose = None
@@ -85,11 +85,12 @@ def predicted_poses(search: Search, sources: Hypotheses, _rng: np.random.Generat
 
 
 def keypoint_poses(search: Search, sources: Hypotheses) -> Hypotheses:
-    """The pose to which keypoints alone would move the heaviest mode.
+    """The pose to which keypoints alone move the heaviest mode, if it misses too many of them.
 
-    There is one where the mode went to where it misses more than a quarter of the keypoints of a
-    group: a silhouette holds limbs that have moved far since the image before. None is further than
-    a person gets meanwhile: keypoints there are those of another, or the track is lost.
+    It is proposed if the optimum of the mode misses more than a quarter of the keypoints of a
+    group, because the silhouette keeps back limbs that have moved far since the previous image. It
+    is dropped if it is out of the person's reach: then the keypoints belong to somebody else, or
+    the track is lost.
     """
     posterior, observation = search.posterior, search.observation
     if posterior.placing(observation) is None:
@@ -106,7 +107,7 @@ def keypoint_poses(search: Search, sources: Hypotheses) -> Hypotheses:
 
 
 def reversed_poses(search: Search, sources: Hypotheses, _rng: np.random.Generator) -> Hypotheses:
-    """The reversal of the best mode where a way to face is lost."""
+    """The reversal of the best mode, if no mode of comparable weight faces one of the ways."""
     log_weights = search.base_rated[: len(search.modes)]
     if not lost_a_facing(search.modes.back, log_weights):
         return sources[:0]
@@ -122,7 +123,7 @@ def _misses_a_group(missed: Misfit) -> bool:
 
 
 def _by_keypoints(search: Search, before: Array | None) -> Array:
-    """The pose x', (1, d), of an image that has keypoints."""
+    """The pose x', (1, d), of an image with keypoints."""
     posterior = search.posterior
     first = search.continuity.predicted[:1] if before is None else before
     placing = posterior.placing(search.observation)

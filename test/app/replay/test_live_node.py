@@ -215,7 +215,7 @@ def test_same_of_raw_images_with_keypoints_masks_and_faults(tmp_path, capsys):
     assert "keypoints ['tail'] are not used" in one[2]
     assert "mask has encoding 'rgb8', wanted mono8 or 8UC1" in one[2]
     assert 'has 480x180 pixels' in one[2]
-    assert 'the track starts anew' in one[2]
+    assert 'the track starts again' in one[2]
     assert len(messages(offline, 'pose_mixture')) == 5
     # The smoother goes back in time as the filter does.
     smoothed = [stamp for stamp, _ in messages(offline, 'smoothed_pose_mixture')]

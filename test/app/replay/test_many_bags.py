@@ -1,4 +1,4 @@
-"""replay of many bags: what is skipped, what is done anew, and the same bytes through Dask."""
+"""replay of many bags: what is skipped, what is done again, and the same bytes through Dask."""
 
 import io
 import json
@@ -116,7 +116,7 @@ def test_what_was_left_half_done_is_done_anew(archive, tracked, tmp_path, monkey
     ]
     assert content(tmp_path / 'out') == wanted
     assert list((tmp_path / 'out').rglob('.*')) == []
-    # A bag that is not as it was left is done anew as well.
+    # A bag that is not as it was left is done again as well.
     (tmp_path / 'out' / 'a' / 'a.mcap').write_bytes(b'')
     assert main(command) == 0
     assert capsys.readouterr().out.startswith('a: 2 of 2 images tracked')

@@ -1,1 +1,1 @@
-"""Files of 2D detectors: one file per family of formats, the check of a clip, and who is chosen."""
+"""Files of 2D detectors: a module per family of formats, check of a clip, choice of a person."""

@@ -1,4 +1,4 @@
-"""Archives of arrays (.npz), as import-video --help describes them."""
+"""Reads archives of arrays (.npz), see import-video --help."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons, person
 from msg_tools.files.array_file import read_archive
 from msg_tools.files.budget import Budget
 
-_LARGEST = 2**28  # bytes; an archive of an hour has 10**8
-_RECORDS = 10  # that a person counts for
+_LARGEST = 2**28  # maximum size, bytes; an archive of an hour has 10**8
+_RECORDS = 10  # number of records that a person counts as
 
 
 def read_arrays(path: Path) -> FoundPersons:
-    """Row t of each array is frame t.
+    """Reads an archive; row t of each array is frame t.
 
     Raises:
-        ValueError: no archive, no keypoints in it, or arrays that do not fit each other.
+        ValueError: no archive, no keypoints in it, or contradictory shapes of arrays.
     """
     content = read_archive(path, _LARGEST)
     budget = Budget(path.stat().st_size)

@@ -1,4 +1,4 @@
-"""The choice of one person among those that a detector sees."""
+"""The choice of one person among all detected ones."""
 
 from __future__ import annotations
 
@@ -14,27 +14,28 @@ from msg_tools.messages.headers import SECOND_NS
 
 LARGEST, NEAREST, INDEX, TRACK = 'largest', 'nearest', 'index', 'id'
 AT, LONGEST = 'at', 'track'
-# A person moves at most by this much of the diagonal of their box from frame to frame.
+# Maximum motion of a person from frame to frame, in diagonals of their box.
 _FASTEST = 0.5
-# A point names the person whose box, larger by this much of its diagonal, has it.
+# Margin around the box of a person within which a point selects them, in diagonals of the box.
 _AROUND = 0.15
-# A track ends when nobody was there for so many frames.
+# Maximum number of frames without the person before a track ends.
 _PATIENCE = 30
-# Pairs of a person and a track that are compared in a clip, and more for each person in it.
+# Maximum number of compared pairs of a person and a track in a clip, and more for each person.
 _FREE_PAIRS, _PAIRS = 20_000, 100
-_LISTED = 8  # names in an error
+_LISTED = 8  # maximum number of names in an error
 
 
 @dataclass(frozen=True)
 class Choice:
-    """How the person to track is chosen among several.
+    """The choice of the person to track among several.
 
     Attributes:
-        kind: `LARGEST`: box in each frame. `NEAREST`: to the person chosen before; the first is
-            the largest. `INDEX`: place in the list of the frame. `TRACK`: name that the detector
-            gives the person. `AT`: at a point of the image at a time, and from there the nearest.
-            `LONGEST`: place among the tracks of the clip, the longest first.
-        value: the place, or the name.
+        kind: `LARGEST`: the largest box in each frame. `NEAREST`: the largest person in the first
+            frame, then the person nearest to the previous one. `INDEX`: an index in the list of
+            each frame. `TRACK`: the name from the detector. `AT`: the person at a point of the
+            image at a time, and from there the nearest. `LONGEST`: a rank among the tracks of the
+            clip, the longest first.
+        value: the index, rank or name.
         point: column and row, px, and time since the first frame, s.
     """
 
@@ -44,10 +45,10 @@ class Choice:
 
     @classmethod
     def parse(cls, text: str) -> Choice:
-        """A choice as the command line has it, such as largest or index:0.
+        """Parses a choice from the command line, such as largest or index:0.
 
         Raises:
-            ValueError: another text.
+            ValueError: the text is no choice.
         """
         kind, colon, value = text.partition(':')
         if kind in (LARGEST, NEAREST) and not colon:
@@ -73,14 +74,14 @@ class Choice:
 def chosen_person(
     found: FoundPersons, choice: Choice, first: int = 0, rate: float | None = None
 ) -> dict[int, Person]:
-    """The chosen person in the frames that have them, by key of the frame.
+    """The chosen person in the frames that show them, by key of the frame.
 
     Args:
-        first: key of the frame from which on the person is looked for.
-        rate: frames per second, for a choice at a time among frames that have numbers.
+        first: key of the first frame to search.
+        rate: frames per second, for a choice by time in frames with numbers.
 
     Raises:
-        ValueError: nobody is so; the line names those that are there.
+        ValueError: no person matches the choice; the line lists alternatives.
     """
     kind, value = choice.kind, choice.value
     if kind == INDEX:
@@ -132,7 +133,7 @@ def _largest(persons: Sequence[Person]) -> Person:
 
 
 def _called(found: FoundPersons, name: str) -> dict[int, Person]:
-    """The person of a name."""
+    """The person with a name, in the frames that show them."""
     likely = found.likely()
     there = {key: x for key, persons in likely.items() for x in persons if x.track == name}
     if not there:
@@ -143,13 +144,13 @@ def _called(found: FoundPersons, name: str) -> dict[int, Person]:
 
 
 def _names_in(found: FoundPersons) -> str:
-    """The names of the persons in a file, the first of them if they are many."""
+    """The names of the persons in a file as text, cut off if they are many."""
     names = sorted({x.track for x in found.persons()} - {''}, key=natural_order)
     return ', '.join(x[:40] for x in names[:_LISTED]) + (', ...' if len(names) > _LISTED else '')
 
 
 def _person_at(persons: Sequence[Person], column: float, row: float) -> Person:
-    """The person at a point of the image."""
+    """The person at or nearest to a point of the image; raises ValueError if none is near."""
     point = np.array([column, row])
     low, high = (np.array([x.box[i] for x in persons]) for i in range(2))
     middles = (low + high) / 2
@@ -162,16 +163,16 @@ def _person_at(persons: Sequence[Person], column: float, row: float) -> Person:
 
 
 def tracks_of(likely: Mapping[int, list[Person]], unit: float = 1.0) -> list[dict[int, Person]]:
-    """The persons of a clip, each in the frames that have them.
+    """The tracks of a clip: each person in the frames that show them.
 
-    In each frame persons are given to the tracks that are nearest, within reach, pair by pair;
-    a name that the detector gives goes before nearness, and another name is another person.
+    In each frame persons are assigned to tracks greedily, the nearest pair first, within reach.
+    Equal names from the detector take precedence over distance; different names never match.
 
     Args:
         unit: difference of keys from frame to frame.
 
     Raises:
-        ValueError: there are so many persons at once that their tracks can not be told apart.
+        ValueError: too many persons at once to follow each.
     """
     tracks: list[dict[int, Person]] = []
     going: list[tuple[int, Person, dict[int, Person]]] = []
@@ -206,7 +207,7 @@ def tracks_of(likely: Mapping[int, list[Person]], unit: float = 1.0) -> list[dic
 def _followed(
     frames: Iterable[tuple[int, list[Person]]], person: Person, unit: float
 ) -> Iterator[tuple[int, Person]]:
-    """The person in frames from theirs on: who is nearest to where they were, within reach."""
+    """Follows a person: yields the nearest person in each frame within reach of the last one."""
     before: int | None = None
     for key, persons in frames:
         if before is not None:
@@ -220,5 +221,5 @@ def _followed(
 
 
 def _in_reach(person: Person, last: Person, gap: float) -> bool:
-    """Whether somebody can have come to a place in so many frames."""
+    """Whether the last person can have moved to the place of a person in so many frames."""
     return person.distance(last) <= _FASTEST * last.size * gap

@@ -1,18 +1,18 @@
-"""The check of a whole clip before its keypoints are believed.
+"""Checks a whole clip before its keypoints are used.
 
-Detectors write numbers whose meaning their files do not tell: percent or fractions, points of
-smaller images, lists in one of several orders. Each has a reading in which the clip shows people:
-confidences up to 1, points all over the image, bones of people's lengths. A reading that fits is
-told; where none fits, the error names the option that helps.
+Files of detectors do not define the meaning of their numbers: percent or fractions, points in
+smaller images, lists in one of several orders. In the right interpretation the clip shows people:
+confidences up to 1, points all over the image, bones with the lengths of people. An interpretation
+that fits is reported to the user; if none fits, the error names the option that helps.
 
 Bones: with d the length of bone b in an image, L that of people and s = sum d / sum L, the 90 %
-quantile q of d / (s L) over the images is near c = 1.18, because a bone that is turned away from
-the image plane in one image lies in it in another:
+quantile q of d / (s L) over the images is near c = 1.18, because a bone that is oblique to the
+image plane in one image is parallel to it in another:
 
     z = (mean_b ((log q_b / c) / sigma_b)^4)^(1/4)
 
-L and sigma are those of `bone_lengths`; sigma is 1.67 times as large where q is below c. In 21
-clips of a detector z is 0.4 to 1.9; in another of the orders of so many points 2 to 14, in most
+L and sigma are those of `bone_lengths`; sigma is 1.67 times as large if q is below c. In 21 clips
+of a detector z is 0.4 to 1.9; in other orders of the same number of points it is 2 to 14, mostly
 above 4.
 """
 
@@ -39,29 +39,30 @@ from hmt_ros.image.keypoint_schemes import (
 )
 from hmt_ros.inference.arrays import Array, Mask
 
-# Largest confidences that detectors write for what they are sure of.
+# Maximum confidences on the scales of detectors.
 _SCALES = (100.0, 255.0, 1000.0)
-# Half of the confidences of a detector that writes fractions are below this.
+# Maximum median of confidences that are fractions.
 _FRACTIONS = 1.5
 _SMALLEST_SCALE = 10.0
-# px, or fractions of the image where all places are within.
+# Maximum coordinate of positions that are fractions of the image.
 _FRACTION = 2.0
-# Least share of the points of at least a confidence that lies in the image, or near it: detectors
-# guess where hidden points are, but are not sure of those that no image shows.
+# Minimum fraction of confident points in or near the image, minimum confidence of these points, and
+# margin around the image, in image sizes. Detectors are not confident of points that they guess.
 _INSIDE, _CONFIDENT, _NEAR = 0.7, 0.5, 0.05
-# Share of the image, from its upper left corner, that points of larger images never keep to.
+# Fraction of width and height within which all points are a sign of smaller images.
 _QUARTER = 0.5
 _SAME_SHAPE = 0.02
-_ENOUGH = 100  # points of a clip that are all alike for a reason
-# A point counts for bones from this confidence on; a check needs so many bones.
+_ENOUGH = 100  # minimum number of points for a conclusion from all of them
+# Minimum confidence of the ends of a bone, and minimum number of bones for a check.
 _SURE, _BONES = 0.3, 6
-_FEWEST, _MOST = 10, 2000  # persons that the check looks at
+_FEWEST, _MOST = 10, 2000  # minimum and maximum number of persons that are checked
 _QUANTILE, _USUAL, _BELOW = 0.9, 1.18, 1.67
-# An order is refused above the first, unless another has less than this part of its z; names, which
-# are told, above the third.
+# Maximum z of an order of points, ratio of z below which another order replaces it, and maximum z
+# of given names.
 _REFUSED, _BETTER, _NAMES_REFUSED = 2.75, 0.6, 3.5
-# A person leaps where all points move by this much of the diagonal of their box, and is back within
-# this much of the leap in one of the next frames; so many leaps, and so many of all steps.
+# A leap: minimum motion of all points, in diagonals of the box; maximum distance after the return,
+# as a fraction of the leap; maximum number of frames until then; minimum number of leaps for an
+# error, and minimum fraction of all steps.
 _LEAP, _BACK, _SOON, _LEAPS, _OFTEN = 0.2, 0.4, 10, 3, 0.1
 
 
@@ -73,15 +74,15 @@ def check_clip(
     scheme: str = AUTO,
     points_size: tuple[int, int] | None = None,
 ) -> None:
-    """Brings confidences, places and names of a clip to their meaning.
+    """Converts confidences, positions and names of a clip to the usual units and scheme.
 
     Args:
         size: width and height of the images, px.
-        scheme: order of unnamed points, `AUTO`: the one that fits.
-        points_size: of the images that the points were found in; None: not known.
+        scheme: order of unnamed points; `AUTO` selects the order that fits.
+        points_size: size of the images in which the points were found, px; None if unknown.
 
     Raises:
-        ValueError: no reading fits; the line names the option to use. Or there is no such scheme.
+        ValueError: no interpretation fits (the line names the option to use), or an unknown scheme.
     """
     scheme_of((), scheme)
     if not any(found.persons()):
@@ -95,13 +96,13 @@ def check_clip(
 
 
 def _likely(found: FoundPersons) -> list[Person]:
-    """Persons of the clip, evenly over it."""
+    """A limited number of likely persons, spread evenly over the clip."""
     persons = [x for those in found.likely().values() for x in those]
     return persons[:: -(-len(persons) // _MOST)]
 
 
 def _scale_confidences(found: FoundPersons, tell: Tell) -> None:
-    """Brings confidences to 0 to 1."""
+    """Scales confidences to 0 to 1."""
     persons = [x.keypoints for x in _likely(found)]
     sure = np.concatenate([x.confidences[x.seen] for x in persons])
     largest, scale = float(sure.max()), 1.0
@@ -120,14 +121,14 @@ def _scale_confidences(found: FoundPersons, tell: Tell) -> None:
 def _scale_places(
     found: FoundPersons, size: tuple[int, int], tell: Tell, points_size: tuple[int, int] | None
 ) -> None:
-    """Brings places to pixels of the images."""
+    """Scales positions to pixels of the images."""
     (width, height), given = size, points_size or found.size
     persons = _likely(found)
     points = np.concatenate([x.keypoints.pixels[x.keypoints.seen] for x in persons])
     factor, shift = np.ones(2), np.zeros(2)
     if found.fractions or np.abs(points).max() <= _FRACTION:
         factor = np.array(size, dtype=np.float64)
-        if points.min() < -1.0 / _FRACTION**2:  # from -1 to 1 over the width
+        if points.min() < -1.0 / _FRACTION**2:  # coordinates from -1 to 1 over the width
             factor, shift = np.full(2, width / 2), np.array(size) / 2
         tell(f'{found.path}: places are fractions of the image, of {width}x{height} pixels')
     elif given is not None:
@@ -146,7 +147,7 @@ def _scale_places(
 
 
 def _check_places(points: Array, sure: Mask, size: tuple[int, int]) -> None:
-    """Raises ValueError where points (n, 2) seem to be those of images of another size."""
+    """Raises ValueError if points (n, 2) seem to be from images of another size."""
     (width, height), shares = size, points / size
     outside = ((shares < -_NEAR) | (shares > 1 + _NEAR)).any(1) & sure
     if outside.sum() > (1 - _INSIDE) * sure.sum():
@@ -164,7 +165,7 @@ def _check_places(points: Array, sure: Mask, size: tuple[int, int]) -> None:
 
 
 def _name_points(found: FoundPersons, tell: Tell, scheme: str) -> None:
-    """Names points in the order in which they are a person."""
+    """Names unnamed points in the order that gives bones the lengths of people."""
     persons = _likely(found)
     names = persons[0].keypoints.names
     alike = [x.keypoints for x in persons if x.keypoints.names == names]
@@ -197,17 +198,17 @@ def _name_points(found: FoundPersons, tell: Tell, scheme: str) -> None:
 
 
 def _rename(found: FoundPersons, scheme: str) -> None:
-    """Gives unnamed points the names of a scheme with as many."""
+    """Gives unnamed points the names of a scheme with the same number of points."""
     names = schemes()[scheme].names
     found.change(lambda x: replace(x, names=names) if len(x.names) == len(names) else x)
 
 
 def bone_deviation(names: Sequence[str], pixels: Array, scheme: str = AUTO) -> float:
-    """How far lengths of bones are from those of people, in standard deviations; NaN: unknown.
+    """Deviation z of bone lengths from those of people, standard deviations; NaN if unknown.
 
     Args:
-        names: (n,) of the points.
-        pixels: (N, n, 2) px of persons; NaN where a point was not seen.
+        names: (n,) names of the points.
+        pixels: (N, n, 2) points of N persons, px; NaN where a point was not seen.
     """
     marks = [x.name if x else '' for x in landmarks_of(names, (), scheme)]
     where = {
@@ -232,10 +233,10 @@ def bone_deviation(names: Sequence[str], pixels: Array, scheme: str = AUTO) -> f
 
 
 def check_steps(persons: Sequence[Person]) -> None:
-    """Raises ValueError where a person leaps to and fro, as two people in one list do.
+    """Raises ValueError if a person leaps back and forth, as when a list mixes two people.
 
     Args:
-        persons: one after the other in time.
+        persons: the person over time.
     """
     leaps = 0
     for i, (before, one) in enumerate(pairwise(persons)):

@@ -20,17 +20,17 @@ from hmt_ros.image.keypoint_schemes import unnamed_orders
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.plain_json import read_plain_json
 
-LARGEST_FILE, LARGEST_LABELS = 2**24, 2**20  # bytes, of a frame
-_BOX = 5  # class, centre and size of a box come before the keypoints
-# Names of the frames of a video, which Ultralytics counts from 1.
+LARGEST_FILE, LARGEST_LABELS = 2**24, 2**20  # maximum size of the file of a frame, bytes
+_BOX = 5  # number of values before the keypoints: class, centre and size of a box
+# Names of files of video frames, which Ultralytics counts from 1.
 _OF_VIDEO = re.compile(r'.*_[1-9]\d*')
 
 
 def read_folder(path: Path, source: FrameSource) -> FoundPersons:
-    """Files such as walk_000000000012_keypoints.json, or walk_13.txt.
+    """Reads files such as walk_000000000012_keypoints.json, or walk_13.txt.
 
     Raises:
-        ValueError: there are none, or they are of no known kind.
+        ValueError: there are no such files, or their format is unknown.
     """
     files = [x for x in path.iterdir() if x.suffix in ('.json', '.txt') and x.is_file()]
     kind = '.json' if any(x.suffix == '.json' for x in files) else '.txt'

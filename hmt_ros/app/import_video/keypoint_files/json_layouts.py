@@ -1,6 +1,6 @@
 """JSON of detectors: COCO, MMPose, AlphaPose, OpenPose, Ultralytics.
 
-Their layouts differ in how frames hold persons, and in the names of what a person has.
+Their layouts differ in the nesting of frames and persons, and in the names of fields.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from hmt_ros.image.keypoint_schemes import recognised
 from hmt_ros.inference.arrays import Array
 from msg_tools.files.plain_json import load_plain_json
 
-LARGEST_FILE = 2**27  # bytes
-# Names of what a person or a frame has, in all layouts.
+LARGEST_FILE = 2**27  # maximum size, bytes
+# Names of the fields of a person or a frame in all layouts.
 _POINTS = ('keypoints', 'pose_keypoints_2d', 'joints')
 _SURE = ('keypoint_scores', 'keypoints_scores', 'keypoint_score')
 _SCORE = ('score', 'bbox_score', 'confidence', 'scores')
@@ -39,7 +39,7 @@ def add_json(found: FoundPersons, content: Any, source: FrameSource) -> None:
     """Adds the persons of all frames in one file.
 
     Raises:
-        ValueError: of no known layout.
+        ValueError: the layout is unknown.
     """
     names: tuple[str, ...] | None = None
     about = content if isinstance(content, dict) else {}
@@ -71,7 +71,7 @@ def add_json(found: FoundPersons, content: Any, source: FrameSource) -> None:
 
 
 def _get(entry: Any, names: Sequence[str], default: Any = None) -> Any:
-    """What an object has under the first of some names that it has."""
+    """The value of an object under the first of some names that it has, or else the default."""
     if not isinstance(entry, dict):
         return default
     return next((entry[x] for x in names if entry.get(x) is not None), default)
@@ -98,13 +98,13 @@ def _annotations(found: FoundPersons, content: dict[str, Any]) -> tuple[Any, lis
 
 
 def frames_in(content: Any, label: Any) -> Iterator[Labelled]:
-    """Labels of frames, and the objects of the persons in them.
+    """Yields labels of frames, and the objects of the persons in them.
 
     Args:
-        label: of the frame whose file it is; None: of many frames.
+        label: label of the frame of the file; None if the file has many frames.
 
     Raises:
-        ValueError: of no known layout.
+        ValueError: the layout is unknown.
     """
     if isinstance(content, dict):
         yield from _frames_of_object(content, label)
@@ -123,7 +123,7 @@ def frames_in(content: Any, label: Any) -> Iterator[Labelled]:
 
 
 def _frames_of_object(content: dict[str, Any], label: Any) -> Iterator[Labelled]:
-    """Frames of an object: of one frame, of frames by name, or of the frames of each person."""
+    """Yields the frames in an object: one frame, frames by name, or frames of each person."""
     persons = _get(content, _PERSONS)
     if 'instance_info' in content:
         yield from frames_in(content['instance_info'], 0)
@@ -151,11 +151,11 @@ def person_in(
     *,
     flags: bool = False,
 ) -> Person | None:
-    """A person as an object of JSON tells it; None if nothing of the person was seen.
+    """Reads a person from a JSON object; returns None if no keypoint was seen.
 
     Args:
         where: name of the object in errors.
-        names: of the points, if the file has them.
+        names: names of the points, if the file has them.
         flags: whether confidences are flags of annotators.
 
     Raises:
@@ -190,7 +190,7 @@ def person_in(
 
 
 def _list(content: dict[str, Any], name: str) -> list[Any]:
-    """A list of objects in an object."""
+    """The list of objects in a field of an object."""
     entries = content.get(name)
     if not isinstance(entries, list) or not all(isinstance(x, dict) for x in entries):
         raise ValueError(f'no list {name}')
@@ -198,9 +198,9 @@ def _list(content: dict[str, Any], name: str) -> list[Any]:
 
 
 def _triples(points: Any, sure: Any, where: str) -> Array:
-    """(n, 3) column, row and confidence of keypoints: triples in a row, or a list of each."""
+    """Column, row and confidence (n, 3) of keypoints, from a flat list or separate lists."""
     try:
-        if isinstance(points, dict):  # of Ultralytics
+        if isinstance(points, dict):  # written by Ultralytics
             sure = points.get('visible') if sure is None else sure
             points = np.array([points.get('x'), points.get('y')], dtype=np.float64).T
         values = np.array(points, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Persons as detectors report them, by frame."""
+"""Detected persons by frame."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from hmt_ros.image.keypoint_schemes import landmark_called, schemes, unnamed_ord
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
 
-_MATCHING_NS = 10_000_000  # between the time of a row and that of its frame
+_MATCHING_NS = 10_000_000  # maximum difference of the times of a row and its frame
 MOST_FRAMES = 10_000_000
-# A person whose score is a smaller part of the best of the clip is none.
+# Minimum score of a person, as a fraction of the best score of the clip.
 _LIKELY = 0.2
 _SUREST = 1e9
 _SIDES = {'l': 'left', 'r': 'right', 'left': 'left', 'right': 'right'}
@@ -33,9 +33,9 @@ class Person:
     """A person in a frame.
 
     Attributes:
-        keypoints: under the detector's names; their covariances are not known (NaN).
-        track: name that the detector gives the person in all frames; '' if it does not track.
-        score: how sure the detector is of the person, of any scale.
+        keypoints: keypoints under the detector's names, with unknown covariances (NaN).
+        track: name of the person in all frames; '' if the detector does not track.
+        score: confidence of the detector in the person, on any scale.
     """
 
     keypoints: Keypoints
@@ -44,7 +44,7 @@ class Person:
 
     @cached_property
     def box(self) -> Array:
-        """(2, 2) least and greatest column and row of the keypoints that were seen."""
+        """Minimum and maximum column and row (2, 2) of the seen keypoints."""
         seen = self.keypoints.pixels[self.keypoints.seen]
         return np.stack([seen.min(0), seen.max(0)])
 
@@ -54,10 +54,10 @@ class Person:
         return float(np.linalg.norm(self.box[1] - self.box[0]))
 
     def distance(self, other: Person) -> float:
-        """Mean distance of the keypoints that both have, px; without any, of the boxes."""
+        """Mean distance of common keypoints, px, or else the distance of the boxes."""
         names, theirs = self.keypoints.names, other.keypoints
         pixels, seen = theirs.pixels, theirs.seen
-        if names != theirs.names:  # rows of a table, of different keypoints
+        if names != theirs.names:  # rows of a table may have different keypoints
             place = {name: i for i, name in enumerate(theirs.names)}
             order = np.array([place.get(name, -1) for name in names])
             pixels, seen = pixels[order], seen[order] & (order >= 0)
@@ -76,18 +76,18 @@ def person(
     track: str = '',
     score: float = 1.0,
 ) -> Person | None:
-    """A person as a detector reports one; None if it sees nothing of the person.
+    """Makes a person from detected keypoints; returns None if no keypoint was seen.
 
-    A keypoint at (0, 0) or at NaN, or without confidence, was not seen.
+    A keypoint at (0, 0) or NaN, or with confidence 0, was not seen.
 
     Args:
-        names: None: those of the usual order of so many points (`unnamed_orders`).
+        names: names of the keypoints; None: the usual order of n points (`unnamed_orders`).
         pixels: (n, 2) px.
-        confidences: (n,), of any scale; None: 1.
-        positions: (n, 3) m; None: the detector does not lift.
+        confidences: (n,) confidences on any scale; None: all 1.
+        positions: (n, 3) m; None if the detector gives no 3D positions.
 
     Raises:
-        ValueError: no order of so many points is known.
+        ValueError: no order of n points is known.
     """
     places = np.array(pixels, dtype=np.float64)
     sure = np.ones(len(places)) if confidences is None else np.array(confidences, dtype=np.float64)
@@ -105,10 +105,10 @@ def person(
 
 
 def orders_of(count: int) -> tuple[str, ...]:
-    """The schemes that a list of so many points without names may have, the usual one first.
+    """Possible schemes of a list of so many points without names, the usual one first.
 
     Raises:
-        ValueError: none is known.
+        ValueError: no scheme is known.
     """
     known = unnamed_orders()
     if count in known:
@@ -125,13 +125,13 @@ def orders_of(count: int) -> tuple[str, ...]:
 
 
 def image_size_of(width: Any, height: Any) -> tuple[int, int] | None:
-    """Width and height that a file gives its images, px; None: no sides that images have."""
+    """Width and height of the images according to a file, px; None if invalid."""
     known = all(isinstance(side, int) and 0 < side <= LARGEST for side in (width, height))
     return (width, height) if known else None
 
 
 def landmark_name(name: str) -> str:
-    """A name of a marker as schemes have it, such as right_big_toe of RBigToe; as it is if none."""
+    """The landmark of a marker, such as right_big_toe for RBigToe; an unknown name is unchanged."""
     text = name.lower() if name.isupper() else name
     words = [x.lower() for x in re.findall(r'[A-Z]?[a-z]+|[A-Z](?![a-z])|\d+', text)]
     if words and words[-1] in _SIDES and words[0] not in _SIDES:
@@ -149,13 +149,13 @@ class FoundPersons:
     """Persons by frame.
 
     Attributes:
-        path: what the detector wrote, for errors.
+        path: file or folder of the detector, for errors.
         frames: persons by number of the frame, or by time since the first frame, ns.
         timed: whether keys are times.
-        rows: number of frames that the file describes one by one; None: it skips frames.
-        size: width and height of the frames that the detector saw, px; None: not known.
-        unnamed: number of points of lists without names; 0: points have names.
-        fractions: whether places are fractions of the image, not px.
+        rows: number of frames of a file with an entry for every frame; None for other files.
+        size: width and height of the frames of the detector, px; None if unknown.
+        unnamed: number of points in lists without names; 0 if points have names.
+        fractions: whether positions are fractions of the image, not px.
     """
 
     path: Any = ''
@@ -167,10 +167,10 @@ class FoundPersons:
     fractions: bool = False
 
     def add(self, key: int, seen: Person | None) -> None:
-        """Adds a person to a frame; None: the frame was looked at.
+        """Adds a person to a frame; None adds only the frame.
 
         Raises:
-            ValueError: there can not be so many frames.
+            ValueError: the number of the frame is too large.
         """
         if not self.timed and key >= MOST_FRAMES:
             raise ValueError(f'frame {key}, wanted at most {MOST_FRAMES} frames')
@@ -178,21 +178,21 @@ class FoundPersons:
 
     @cached_property
     def keys(self) -> list[int]:
-        """The keys in order, once all persons are there."""
+        """The sorted keys; call it only after all persons were added."""
         return sorted(self.frames)
 
     @property
     def last(self) -> int:
-        """Number of the last frame with an entry; -1 without one, or where only times are known."""
+        """Number of the last frame with an entry; -1 without entries, or if keys are times."""
         return -1 if self.timed else max(self.frames, default=-1)
 
     @property
     def lifts(self) -> bool:
-        """Whether the detector has positions in space."""
+        """Whether the detector gives 3D positions."""
         return any(x.keypoints.positions is not None for x in self.persons())
 
     def key_of(self, frame: Frame) -> int | None:
-        """Key of a frame; None: the file does not have it."""
+        """Key of a frame; None if the file does not have the frame."""
         wanted, apart = (frame.time_ns, _MATCHING_NS) if self.timed else (frame.number, 0)
         at = bisect_left(self.keys, wanted)
         near = [x for x in self.keys[max(at - 1, 0) : at + 1] if abs(x - wanted) <= apart]
@@ -204,7 +204,7 @@ class FoundPersons:
             yield from found
 
     def likely(self) -> dict[int, list[Person]]:
-        """The persons whose score does not say that they are none, by frame in order."""
+        """The persons with a sufficient score, by frame in order."""
         best = max((x.score for x in self.persons()), default=0.0)
         return {
             key: [x for x in found if x.score >= _LIKELY * best or best <= 0.0]
@@ -212,19 +212,19 @@ class FoundPersons:
         }
 
     def change(self, changed: Callable[[Keypoints], Keypoints]) -> None:
-        """Replaces the keypoints of each person."""
+        """Replaces the keypoints of each person by the result of a function of them."""
         for key, found in self.frames.items():
             self.frames[key] = [replace(x, keypoints=changed(x.keypoints)) for x in found]
 
 
 def numbers_of(labels: Sequence[str | int], source: FrameSource, *, from_one: bool) -> list[int]:
-    """Numbers of frames, from 0, of labels.
+    """Numbers, from 0, of the frames with some labels.
 
     Args:
-        from_one: whether the detector counts frames from 1, unless the source says from where.
+        from_one: whether the detector counts from 1, unless the source defines the numbers.
 
     Raises:
-        ValueError: a label means no frame.
+        ValueError: a label refers to no frame.
     """
     numbers = [source.number_of(label) for label in labels]
     shift = from_one and source.first_number == 0 and not source.names and 0 not in numbers

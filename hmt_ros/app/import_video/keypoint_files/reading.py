@@ -1,4 +1,4 @@
-"""Reads what a detector wrote, whatever the format."""
+"""Reads the output of a detector in any known format."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools.files.error_line import error_line
 from msg_tools.files.plain_json import read_plain_json
 
-_FARTHEST = 1e5  # px; no image is so large
+_FARTHEST = 1e5  # maximum coordinate of a keypoint, px
 
 
 @dataclass(frozen=True)
 class ClipReading:
-    """How the keypoints of a clip are to be read, as far as one knows.
+    """Options for reading the keypoints of a clip.
 
     Attributes:
-        person: who is chosen.
-        scheme: order of points without names; `AUTO`: the one in which they are a person.
-        points_size: width and height of the images that the points were found in, px.
+        person: choice of the person.
+        scheme: order of points without names; `AUTO` selects the order that fits people.
+        points_size: width and height of the images in which the points were found, px.
         mirror: whether the images are mirror images.
     """
 
@@ -47,10 +47,10 @@ def read_keypoints(path: Path, source: FrameSource, first_stamp_ns: int) -> Foun
     """Reads the output of a detector for the frames of a source.
 
     Args:
-        first_stamp_ns: stamp of the first frame, which stamps in the file refer to.
+        first_stamp_ns: stamp of the first frame, to which stamps in the file refer.
 
     Raises:
-        ValueError: the file is missing, unreadable, of no known kind, or contradicts itself.
+        ValueError: the file is missing, unreadable, of unknown format, or contradictory.
     """
     kind = path.suffix.lower()
     try:
@@ -95,10 +95,10 @@ def keypoints_of_person(
     Args:
         size: width and height of the images, px.
         first: key of the first frame.
-        rate: frames per second, as far as known.
+        rate: frames per second, if known.
 
     Raises:
-        ValueError: the clip contradicts itself, or has no such person; the line says what to do.
+        ValueError: the clip is contradictory, or has no such person; the line names a remedy.
     """
     told: list[str] = []
     check_clip(found, size, told.append, scheme=reading.scheme, points_size=reading.points_size)
@@ -116,7 +116,7 @@ def keypoints_of_person(
 
 
 def mirrored(keypoints: Keypoints, width: int) -> Keypoints:
-    """Keypoints of the image that a mirror image, of a width in px, was made from."""
+    """Converts keypoints of a mirrored image of a width, px, to those of the original image."""
     positions = keypoints.positions
     return replace(
         keypoints,

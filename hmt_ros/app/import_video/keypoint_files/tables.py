@@ -1,4 +1,4 @@
-"""Tables: those of import-video --help (.csv), of DeepLabCut (.csv), and markers (.trc)."""
+"""Reads tables: .csv as in import-video --help or of DeepLabCut, and .trc of markers."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from msg_tools.files.error_line import error_line
 from msg_tools.files.plain_json import LARGEST
 from msg_tools.messages.headers import SECOND_NS
 
-LARGEST_FILE = 2**26  # bytes
-_CELL = 64  # bytes
+LARGEST_FILE = 2**26  # maximum size, bytes
+_CELL = 64  # memory of a cell, bytes
 FRAME, TIME, STAMP = 'frame', 'time_s', 'stamp_ns'
-# Times from the first on are Unix times, and later ones than the second not in seconds.
+# Minimum of Unix times, and maximum of times in seconds.
 _UNIX, _LATEST = 1e8, 1e11  # s
-# Places that all lie within are those of a calibrated system, m.
+# Maximum coordinate of positions in metres, from a calibrated system.
 _METRES = 20.0
 
-# Line, frame or time, person, keypoint, and cells of column, row and confidence.
+# Line, frame or time, person, keypoint, and texts of column, row and confidence.
 Cells = tuple[int, str, str, str, tuple[str, str, str]]
 
 
 def read_table(path: Path, source: FrameSource, first_stamp_ns: int) -> FoundPersons:
-    """A table of a known kind.
+    """Reads a table of a known kind.
 
     Args:
-        first_stamp_ns: stamp of the first frame, which stamps in the file refer to.
+        first_stamp_ns: stamp of the first frame, to which stamps in the file refer.
 
     Raises:
-        ValueError: it is none, or contradicts itself.
+        ValueError: the file is no such table, or contradictory.
     """
     try:
         text = read_bytes(path, LARGEST_FILE).decode('utf-8-sig')
@@ -47,7 +47,7 @@ def read_table(path: Path, source: FrameSource, first_stamp_ns: int) -> FoundPer
         raise ValueError('not a table: the file is not text in UTF-8') from error
     markers, budget = path.suffix.lower() == '.trc', Budget(len(text))
     separator = '\t' if markers else ','
-    # Python takes as much for a cell and its place in a list, and for a line twice that.
+    # Memory in Python of the text, of each cell with its entry in a list, and of each line.
     needed = 2 * len(text) + _CELL * (text.count(separator) + 2 * text.count('\n'))
     if needed > LARGEST:
         raise ValueError(f'a table whose cells take {needed} bytes, wanted at most {LARGEST}')
@@ -82,7 +82,7 @@ def read_table(path: Path, source: FrameSource, first_stamp_ns: int) -> FoundPer
 
 
 def _of_rows(table: list[list[str]], when: str, budget: Budget) -> Iterator[Cells]:
-    """A row for each person in a frame (NAME_u, NAME_v, ...), or for each keypoint (name, u, v)."""
+    """Yields cells of a table with a row per person (NAME_u, ...) or per keypoint (name, u, v)."""
     columns = table[0] if table else []
     if not when:
         raise ValueError(f'wanted a column frame, time_s or stamp_ns, saw {columns[:8]}')
@@ -110,7 +110,7 @@ def _of_rows(table: list[list[str]], when: str, budget: Budget) -> Iterator[Cell
 
 
 def _of_deeplabcut(table: list[list[str]], budget: Budget) -> Iterator[Cells]:
-    """Rows below a head of scorer, individuals (of several animals), bodyparts and coords."""
+    """Yields cells below a header of scorer, individuals (if several), bodyparts and coords."""
     depth = next(i for i, x in enumerate(table) if x[:1] == ['coords'])
     heads = {x[0]: x for x in table[: depth + 1] if x}
     coordinates = heads['coords']
@@ -130,7 +130,7 @@ def _of_deeplabcut(table: list[list[str]], budget: Budget) -> Iterator[Cells]:
 
 
 def _of_markers(table: list[list[str]]) -> Iterator[Cells]:
-    """Rows of frame, time, and X, Y, Z of each marker, with Z 0, as Sports2D writes pixels."""
+    """Yields cells of rows of frame, time, and X, Y, Z = 0 of each marker, px, from Sports2D."""
     head = next((i for i, x in enumerate(table) if x[:1] == ['Frame#']), None)
     if head is None:
         raise ValueError('no line Frame#, wanted a table of markers (.trc)')
@@ -157,7 +157,7 @@ def _of_markers(table: list[list[str]]) -> Iterator[Cells]:
 
 
 def _landmarks(parts: Sequence[str]) -> dict[str, str]:
-    """Landmarks by the names of those markers that are landmarks."""
+    """Landmark of each marker with a known name; raises ValueError if there is none."""
     names = {x: landmark_name(x) for x in parts}
     known = {x: name for x, name in names.items() if landmark_called(name) is not None}
     if not known:
@@ -166,7 +166,7 @@ def _landmarks(parts: Sequence[str]) -> dict[str, str]:
 
 
 def _keys(labels: Sequence[str], when: str, source: FrameSource, first_stamp_ns: int) -> list[int]:
-    """Keys of frames in a column; Unix times count from the first."""
+    """Keys of frames from a column; Unix times are relative to the first."""
     if when == FRAME:
         return [source.number_of(x) for x in labels]
     try:
@@ -175,7 +175,7 @@ def _keys(labels: Sequence[str], when: str, source: FrameSource, first_stamp_ns:
         raise ValueError(f'{when} has {error_line(error)[:60]}, wanted numbers') from error
     first, unit = min(times, default=0), 1
     while when == TIME and first / unit > _LATEST * SECOND_NS:
-        unit *= 1000  # milliseconds, or less
+        unit *= 1000  # milliseconds or shorter units
     if when == STAMP:
         first = first_stamp_ns
     elif first / unit < _UNIX * SECOND_NS:
@@ -187,7 +187,7 @@ def _keys(labels: Sequence[str], when: str, source: FrameSource, first_stamp_ns:
 
 
 def _number(text: str, line: int) -> float:
-    """A cell; NaN where it is empty."""
+    """The number in a cell; NaN if it is empty."""
     try:
         return float(text) if text else math.nan
     except ValueError as error:

@@ -462,7 +462,7 @@ class Film {
     picture.onload = () => { if (shown.time === index) this.draw(); };
     picture.src = `data:image/jpeg;base64,${jpeg}`;
     this.pictures.set(index, picture);
-    // The oldest are decoded anew when they are wanted again.
+    // The oldest are decoded again when they are wanted again.
     if (this.pictures.size > 64) this.pictures.delete(this.pictures.keys().next().value);
     return picture;
   }
