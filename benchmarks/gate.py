@@ -125,7 +125,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
 
 
 def read_table(path: Path) -> dict[str, Any]:
-    """Floors by clips, inputs and images a second, as checked in; empty where there are none."""
+    """Floors by clips, inputs and images a second, as checked in; empty if missing."""
     return dict(json.loads(path.read_text('utf-8'))) if path.is_file() else {}
 
 

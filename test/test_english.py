@@ -8,7 +8,7 @@ def test_phrases_are_found_with_their_lines(tmp_path, capsys):
     path.write_text('People, of whom one waits.\n\nThe track starts anew. None: there is none.\n')
     assert [line.partition(': ')[2] for line in stumbling(path)] == [
         '"of whom"; better a sentence of its own',
-        '": there is none"; better "none", "... if there is none"',
+        '": there is none"; better "none", "... if missing"',
         '"anew"; better "again"',
     ]
     assert main([str(path)]) == 1

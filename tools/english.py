@@ -19,11 +19,10 @@ ROOT = Path(__file__).resolve().parents[1]
 SUFFIXES = ('.py', '.md', '.h', '.cpp', '.sh', '.bash', '.yaml', '.msg', '.srv', '.js', '.html')
 # Regular expressions, and what to write instead.
 PHRASES = {
-    r': there (?:is|are) none\b': '"none", "... if there is none"',
+    r'(?::|if|where) there (?:is|are) none\b': '"none", "... if missing"',
     r'\bof whom\b': 'a sentence of its own',
     r'\banew\b': '"again"',
     r'\bwhoever\b': '"anybody who", "the person who"',
-    r'\bas it is, or\b': '"unchanged, or"',
     r'\bgo(?:es)? on with\b': '"continues with"',
     r'\btakes? in an? (?:image|message)\b': '"uses", "updates from"',
     r'\bis told (?:by|again)\b': '"is given by", "is reported again"',

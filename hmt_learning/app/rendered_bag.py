@@ -166,7 +166,7 @@ def _write_truth(
     scene: Scene,
     masks: NDArray[np.uint8] | None = None,
 ) -> None:
-    """Writes the ground truth of a motion; without silhouettes where there are none."""
+    """Writes the ground truth of a motion; silhouettes are optional."""
     silhouettes: dict[str, Any] = {} if masks is None else {'masks': masks}
     count = len(take.poses)
     np.savez_compressed(

@@ -359,7 +359,7 @@ def _mixtures(
 
 
 def _pose(content: PoseMixture, identity: int | None) -> TrackedPose | None:
-    """The heaviest component, or the heaviest with the identity; None if there is none."""
+    """The heaviest component, or the heaviest with the identity; None if missing."""
     assert content.identities is not None
     weights = content.weights
     if identity is not None:

@@ -225,7 +225,7 @@ def _lift(arguments: argparse.Namespace) -> int:
 def _in_frames(
     found: FoundPersons, chosen: dict[int, Keypoints], fps: float
 ) -> tuple[list[int], list[Keypoints]]:
-    """Times, ns, and keypoints of the chosen person; `NO_KEYPOINTS` where there are none."""
+    """Times, ns, and keypoints of the chosen person; `NO_KEYPOINTS` where the person is missing."""
     sparse = found.timed or found.last > _GAPS * len(found.frames)
     keys = found.keys if sparse else list(range(found.last + 1))
     times = keys if found.timed else [round(key * SECOND_NS / fps) for key in keys]

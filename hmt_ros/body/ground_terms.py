@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -207,22 +208,15 @@ def upright_segments(skeleton: Skeleton, hidden: tuple[int, ...] = ()) -> Uprigh
     known = [(trunk, spine, TRUNK_LEAN, TRUNK_SIGMA)]
     if skeleton.segment_dofs[trunk]:
         known.append((0, columns[0, 2], PELVIS_LEAN, PELVIS_SIGMA))
-    for knee, ankle in zip(*(_sided(skeleton, x) for x in ('knee', 'ankle')), strict=True):
-        shank = int(skeleton.joint_segments[knee])
-        if shank in hidden:
-            known.append((shank, joints[knee] - joints[ankle], SHANK_LEAN, SHANK_SIGMA))
+    for own in skeleton.chains.values():
+        for shank, foot in pairwise(own[1:]):
+            if shank in hidden:
+                known.append((shank, origins[shank] - origins[foot], SHANK_LEAN, SHANK_SIGMA))
     return Upright(
         np.array([segment for segment, *_ in known], dtype=np.intp),
         np.array([_axes(columns, segment, up, lean) for segment, up, lean, _ in known]),
         np.array([[aside, ahead, ahead] for *_, (aside, ahead) in known]),
     )
-
-
-def _sided(skeleton: Skeleton, kind: str) -> list[int]:
-    """Return the left and right joints of a kind, or none if one is missing."""
-    names = [f'left_{kind}', f'right_{kind}']
-    known = {*names} <= {*skeleton.joint_names}
-    return [int(i) for i in skeleton.joint_index(names)] if known else []
 
 
 @lru_cache(maxsize=16)

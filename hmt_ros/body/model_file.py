@@ -54,7 +54,7 @@ def model_names() -> list[str]:
 
 
 def shipped_file(body: str, kind: str) -> Path | None:
-    """Return the shipped file of a body, of kind 'prior' or 'motion', or None if there is none.
+    """Return the shipped file of a body, of kind 'prior' or 'motion', or None if missing.
 
     Names may come from messages, so they must not open other files.
     """

@@ -108,7 +108,7 @@ def motion_prior(body: Body) -> LinearGaussianDynamics:
 
 @cache
 def shipped_motion(name: str) -> LearnedMotion | None:
-    """The motion prior that ships for the body of a name; None if there is none.
+    """The motion prior that ships for the body of a name; None if missing.
 
     Raises:
         ValueError: the file that ships is damaged.

@@ -182,7 +182,7 @@ class _ShapeTable(NamedTuple):
     """The shape as compiled code reads it.
 
     Attributes:
-        part_of: (S,) part on each segment; -1 if there is none.
+        part_of: (S,) part on each segment; -1 if missing.
         centres, radii: (B, 3) of the parts.
         by_centre, by_radius: (B, 3, P) their derivatives.
         joint_basis: (J, 3, L) of the skeleton.

@@ -42,7 +42,7 @@ inline void expect_factors(const char* name, const Numbers& factors, Index segme
   for (double x : factors) expect(0.0 <= x && x < infinity, name, "finite factors, none below 0");
 }
 
-// The factor of a segment; where there are none it is 1.
+// The factor of a segment; 1 without factors.
 inline double factor_of(const Numbers& factors, Index segment) {
   return factors.empty() ? 1.0 : factors[segment];
 }

@@ -235,7 +235,7 @@ inline bool bracketed_roots(const ContourCondition& condition, double* cosines, 
 }
 
 // Cosines and sines (2,) of the angles of the contour on a ring that is no ellipse or leans by
-// different slopes; false if there are none.
+// different slopes; false if missing.
 inline bool contour_angles(const Ring& ring, double bx, double by, double uz, double* cosines,
                            double* sines) {
   const ContourCondition condition{bx, by, uz, ring.slopes[0], ring.slopes[1], 2.0 - ring.exponent};

@@ -155,7 +155,7 @@ def _sliding(
     names: Sequence[str],
     truth: Mapping[int, TrueGround],
 ) -> float | None:
-    """Return the mean speed of standing ankles, m/s; None if there are none."""
+    """Return the mean speed of standing ankles, m/s; None if missing."""
     if len(stamps) < 2:
         return None
     usual = _GAP * float(np.median(np.diff(stamps)))

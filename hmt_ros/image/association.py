@@ -138,7 +138,7 @@ def assigned(
 
 
 def unknown_area(mine: Mask, nearer: Sequence[Mask], farther: Sequence[Mask]) -> Mask | None:
-    """Pixels (H, W) without evidence about a person; None if there are none.
+    """Pixels (H, W) without evidence about a person; None if missing.
 
     Args:
         mine: (H, W) that the person covers.

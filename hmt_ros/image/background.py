@@ -96,7 +96,7 @@ class Silhouette(NamedTuple):
     Attributes:
         foreground: (H, W) pixels of the person.
         unsure: (H, W) pixels darker than the background in the same colour: a shadow, or clothes
-            in the colours of the scene; None if there are none.
+            in the colours of the scene; None if missing.
     """
 
     foreground: Mask
@@ -170,7 +170,7 @@ class BackgroundModel:
 
     @property
     def unknown(self) -> Mask | None:
-        """Pixels (H, W) not yet seen without the person since `forget`; None if there are none."""
+        """Pixels (H, W) not yet seen without the person since `forget`; None if missing."""
         return None if self._parts is None else self._parts.unknown
 
     @property
@@ -209,7 +209,7 @@ class BackgroundModel:
         """Foreground of an image, as for `silhouette`, and unsure pixels.
 
         Args:
-            others: (H, W) pixels that somebody else covers; None if there are none.
+            others: (H, W) pixels that somebody else covers; None if missing.
         """
         raw = self._subtracted(image)
         if others is not None:

@@ -30,7 +30,7 @@ class Landmark:
 
     Attributes:
         name: canonical name.
-        joint: joint of our bodies at or near the landmark; '' if there is none.
+        joint: joint of our bodies at or near the landmark; '' if missing.
         offset: (3,) from the joint in the frame of the joint's segment, m, of a person of 1.7 m.
         sigma: standard deviation of each component of the offset over people, m.
     """

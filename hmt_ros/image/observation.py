@@ -62,10 +62,10 @@ class Observation:
         evidence: evidence by name of the term; terms without evidence in the image are left out.
         foreground: (H, W) pixels that differ from the background, believed or not; None: unknown.
         depths: m, believed or not; None: unknown.
-        flow: optical flow from the image before, two channels, px; None if there is none.
-        others: (H, W) pixels that somebody else covers or may cover; None if there are none.
+        flow: optical flow from the image before, two channels, px; None if missing.
+        others: (H, W) pixels that somebody else covers or may cover; None if missing.
         hidden: (S,) segments that something else covers, so that the image is no evidence about
-            them; None if there are none.
+            them; None if missing.
         beliefs: probabilities of the cues; None: all are believed.
         magnification: px/m at the distance of the person; 0 if unknown: contours of people are then
             assumed to equal the model's.
@@ -117,8 +117,8 @@ def observe(
         last_image: the image before, of the same size, that the optical flow starts from; None:
             the flow is not computed.
         wanted: names of terms; None: all.
-        unsure: (H, W) pixels that may belong to the silhouette; None if there are none.
-        others: (H, W) pixels that somebody else covers; None if there are none.
+        unsure: (H, W) pixels that may belong to the silhouette; None if missing.
+        others: (H, W) pixels that somebody else covers; None if missing.
         depth: (H, W) depth along the axis of the camera, m; None: unknown. 0, NaN and values out of
             range are no evidence.
 

@@ -48,7 +48,7 @@ def on_raster(image: NDArray[Any], raster: Mask) -> NDArray[Any]:
 
 
 def largest_person(foreground: Mask, step: int = 1) -> Piece | None:
-    """The largest piece of a foreground that has the shape of one person; None if there is none.
+    """The largest piece of a foreground that has the shape of one person; None if missing.
 
     A piece is connected, or it is the largest one with the pieces near it: clothes in the colours
     of the room leave gaps.

@@ -133,7 +133,7 @@ class PoseEnergy:
     Attributes:
         likelihood: image likelihood of the body.
         terms: terms that read the frames of a pose, at most one of each kind that has a kernel.
-        motion: prior around the expected poses, over the free variables; None if there is none.
+        motion: prior around the expected poses, over the free variables; None if missing.
         point: (d,) values of all variables; None: all are free.
         free: (f,) indices of the variables that may move, if `point` is given.
         counted: called with the number of poses that were evaluated; None: not called.

@@ -114,7 +114,7 @@ class Silhouettes:
             stamp: of the image, ns.
             mask: (H, W) of a segmenter, if any.
             region: where the person can be; None: anywhere.
-            others: (H, W) pixels that somebody else covers; None if there are none.
+            others: (H, W) pixels that somebody else covers; None if missing.
         """
         if mask is not None:
             mask = mask if others is None else mask & ~others

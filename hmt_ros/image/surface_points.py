@@ -45,7 +45,7 @@ def seen_points(
         body: with flesh.
         camera: camera that sees it.
         frames: frames of the K poses.
-        others: (H, W) pixels that show or may show somebody else; None if there are none.
+        others: (H, W) pixels that show or may show somebody else; None if missing.
         points: maximum number Q of points per pose.
     """
     k = frames.count

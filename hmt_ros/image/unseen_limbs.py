@@ -80,7 +80,7 @@ class UnseenLimbs:
         """Updates the times by an image and the likeliest pose (d,) in it.
 
         Args:
-            dt: time since the image before, s; inf if there is none.
+            dt: time since the image before, s; inf for the first image.
         """
         shown = shown_segments(body, camera, observation, pose)
         self.times = np.where(shown, 0.0, self.times + dt)

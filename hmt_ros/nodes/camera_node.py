@@ -52,7 +52,7 @@ FRAME_ID = 'camera_optical_frame'
 _USUAL_RATE = 30.0
 # Time without an image after which a device counts as unplugged, and interval of attempts to open
 # it, s.
-_PATIENCE, _REOPENED = 2.0, 1.0
+_PATIENCE, _REOPENED = 5.0, 1.0
 _GLANCE, _CONNECTING = 0.05, 0.5
 # Time limit for an active node to be discovered as subscriber, s: participants announce themselves
 # every 3 s.

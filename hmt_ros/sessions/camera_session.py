@@ -83,7 +83,7 @@ class WaitingImage(NamedTuple):
     given: Mapping[str, Any] = MappingProxyType({})
 
     def content(self, name: str) -> Any:
-        """Return the content of an input for the image; None if there is none."""
+        """Return the content of an input for the image; None if missing."""
         return self.given.get(name)
 
     @property

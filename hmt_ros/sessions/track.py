@@ -116,7 +116,7 @@ class Track:
         start: start of the track.
         tracker: the tracker; None before the first image after a restart.
         body: body that was published last; None before the first after a restart.
-        weights: weights of the present mixture; empty if there is none.
+        weights: weights of the present mixture; empty if missing.
         robot: outputs for robots; may be read by any thread.
     """
 

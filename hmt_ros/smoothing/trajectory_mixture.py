@@ -50,7 +50,7 @@ class TrajectoryMixture:
         weights_in_time: (T, M) total probability of the modes near each motion at each time; None:
             the weights.
         strays: T mixtures of modes far from all motions, with their probabilities; they are the
-            last components of the marginals. Empty if there are none.
+            last components of the marginals. Empty if missing.
 
     Raises:
         ValueError: shapes are inconsistent, or weights do not sum to 1.

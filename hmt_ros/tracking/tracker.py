@@ -353,7 +353,7 @@ class Tracker:
         return believed
 
     def _search(self, observation: Observation, prediction: PosePrediction | None) -> Array | None:
-        """Poses for a search in the image, see `poses_to_search`; None if there are none."""
+        """Poses for a search in the image, see `poses_to_search`; None if missing."""
         gravity = self._ground.gravity(self.settings.ground.upright_weight)
         return poses_to_search(self._track.person, self.camera, observation, prediction, gravity)
 

@@ -114,7 +114,7 @@ class PoseMixture:
         ancestry: (K, M) probability that each component continues component m of the previous
             likelihood; each row sums to 1. M = 0 for new modes; None if unknown.
         ancestry_stamp_ns: stamp of the previous likelihood; 0 if unknown or missing.
-        ancestry_ids: (M,) identities of the previous likelihood; None if there is none.
+        ancestry_ids: (M,) identities of the previous likelihood; None if missing.
 
     Raises:
         MessageError: invalid shapes or values.

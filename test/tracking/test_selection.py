@@ -20,7 +20,7 @@ def distance(a, b, same=SAME, cap=CAP):
 
 
 def objective(joints, weights, chosen):
-    """Expected distance from a hypothesis to the nearest of the chosen; CAP where there is none."""
+    """Expected distance from a hypothesis to the nearest of the chosen; CAP if none is chosen."""
     nearest = [min([CAP] + [distance(x, joints[c]) for c in chosen]) for x in joints]
     return float(np.dot(weights, nearest))
 

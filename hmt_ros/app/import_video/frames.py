@@ -333,7 +333,7 @@ class Masks:
 
     @property
     def last(self) -> int:
-        """Number of the last frame that has a mask; -1 if there is none, or in a video."""
+        """Number of the last frame that has a mask; -1 if missing, or in a video."""
         return max(self._files, default=-1)
 
     def of(self, frame: Frame) -> Mask | None:

@@ -219,7 +219,7 @@ def recorded_input(
 
 
 def upright_frame(bag: BagReader, recorded: RecordedInput) -> str:
-    """The nearest ancestor of the camera frame in `UPRIGHT_FRAMES`; empty if there is none."""
+    """The nearest ancestor of the camera frame in `UPRIGHT_FRAMES`; empty if missing."""
     names = {topic.name for topic in (recorded.transforms or {}).values()}
     if not names:
         return ''

@@ -68,7 +68,7 @@ class FilmStrip:
 def image_source(
     out: Path, images: Path | None, image_topic: str | None, camera_info_topic: str | None
 ) -> ImageSource | None:
-    """Finds the images that belong to a bag of mixtures; returns None if there are none.
+    """Finds the images that belong to a bag of mixtures; returns None if missing.
 
     The images are those in the bag `images`, else those in `out` if it has a calibration, else the
     drawings of the tracker in `out`.

@@ -57,7 +57,7 @@ def angles_of(body: Body | None) -> tuple[str, ...]:
 
 
 def ground_at(grounds: Mapping[int, GroundState], stamp_ns: int) -> GroundState | None:
-    """The ground at a time, or else the first known ground; None if there is none."""
+    """The ground at a time, or else the first known ground; None if missing."""
     return grounds.get(stamp_ns) or next(iter(grounds.values()), None)
 
 

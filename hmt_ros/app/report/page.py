@@ -59,7 +59,7 @@ class Content:
         scores: scores by topic; empty without truth.
         notes: contents that the page leaves out, and why.
         grounds: floor and contacts by stamp; empty if unknown.
-        detector: skeletons of a detector of 3D positions; None if there are none.
+        detector: skeletons of a detector of 3D positions; None if missing.
     """
 
     title: str

@@ -515,7 +515,7 @@ class Combiner {
   Scratch<Index, 2> taken_{count_, limit_};
   LeastSums least_sums_{limit_, most_, count_};
 
-  // The mode whose next product is the best; -1 if there is none.
+  // The mode whose next product is the best; -1 if missing.
   Index best_mode(Index modes) const {
     Index best = -1;
     for (Index g = 0; g < modes; ++g) {

@@ -217,7 +217,7 @@ class TreeGrowth {
   }
 
   // Finds angles i and j of link k within their limits, of two solutions those nearest the given;
-  // false if there are none. Angle j is one or two; angle i is that of (x, y), turned by pi for the
+  // false if missing. Angle j is one or two; angle i is that of (x, y), turned by pi for the
   // second, and stays where (x, y) vanishes: it has no effect on the segment.
   bool choose(const ChainLinks& chain, Index k, Index i, Index j, double one, double two, double y,
               double x) {

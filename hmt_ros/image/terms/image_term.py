@@ -58,11 +58,11 @@ class ImageWindow:
         image: (h, w, 3) BGR.
         left, top: column and row of its first pixel in the whole image.
         mask: (h, w) silhouette, 0 or 1; None: unknown.
-        unsure: (h, w) pixels that may belong to it, 0 or 1; None if there are none.
-        last_image: (h, w, 3) the same part of the image before; None if there is none.
+        unsure: (h, w) pixels that may belong to it, 0 or 1; None if missing.
+        last_image: (h, w, 3) the same part of the image before; None if missing.
         others: (h, w) pixels that show or may show somebody else, 0 or 1, and are evidence neither
-            for a pose nor against it; None if there are none.
-        depth: (h, w) the same part of the depth image, m; None if there is none.
+            for a pose nor against it; None if missing.
+        depth: (h, w) the same part of the depth image, m; None if missing.
     """
 
     image: Image
@@ -111,7 +111,7 @@ class ImageTerm:
         name: name of the term, of its settings and of its evidence.
         meaning: the quantities that it compares; the descriptions of its parameters begin with it.
         settings: default settings.
-        evidence: takes the evidence of the term from an image; returns None if there is none.
+        evidence: takes the evidence of the term from an image; returns None if missing.
         inputs: makes the inputs of the core: a NamedTuple that starts with the `Weighting`, read
             member by member into the struct of its header. Without evidence (None) it has weight 0
             and empty arrays of the same types.

@@ -13,7 +13,7 @@ def at(u, v=100.0, size=10.0, track='', score=1.0):
 
 
 def chosen(text, frames, numbers=None, **about):
-    """Left end of the box of the person in each frame, and None where there is none."""
+    """Left end of the box of the person in each frame, None without a box."""
     numbers = numbers or range(len(frames))
     found = FoundPersons(frames=dict(zip(numbers, frames)), **about)
     there = chosen_person(found, Choice.parse(text), rate=10.0)

@@ -269,7 +269,7 @@ def test_keys_buttons_detector_regions_and_shadow(made, body, poses, tmp_path):
         // Ellipses against points of the ellipsoids.
         const [layer] = layers;
         const offset = layer.starts[shown.time];
-        const places = layer.joints.map((_, joint) => space.joint(layer, offset, joint));
+        const places = layer.joints.map((_, joint) => jointOf(layer, offset, joint));
         const project = space.projection(600, 400);
         const ellipses = [];
         const pen = { beginPath() {}, fill() {}, stroke() {} };

@@ -48,7 +48,7 @@ class Choice:
         """Parses a choice from the command line, such as largest or index:0.
 
         Raises:
-            ValueError: the text is no choice.
+            ValueError: the text is not a choice.
         """
         kind, colon, value = text.partition(':')
         if kind in (LARGEST, NEAREST) and not colon:

@@ -39,7 +39,7 @@ def read_table(path: Path, source: FrameSource, first_stamp_ns: int) -> FoundPer
         first_stamp_ns: stamp of the first frame, to which stamps in the file refer.
 
     Raises:
-        ValueError: the file is no such table, or contradictory.
+        ValueError: the file is not such a table, or contradicts itself.
     """
     try:
         text = read_bytes(path, LARGEST_FILE).decode('utf-8-sig')
@@ -157,7 +157,7 @@ def _of_markers(table: list[list[str]]) -> Iterator[Cells]:
 
 
 def _landmarks(parts: Sequence[str]) -> dict[str, str]:
-    """Landmark of each marker with a known name; raises ValueError if there is none."""
+    """Landmark of each marker with a known name; raises ValueError if no name is known."""
     names = {x: landmark_name(x) for x in parts}
     known = {x: name for x, name in names.items() if landmark_called(name) is not None}
     if not known:

@@ -86,17 +86,26 @@ function motionsOf(layer) {
 
 const DIRECTIONS = [['to the left', 'to the right'], ['lower', 'higher'], ['farther', 'nearer']];
 
+/** A joint of a mode, m. */
+function jointOf(figure, offset, joint) {
+  const i = (offset * figure.joints.length + joint) * 3;
+  return [...figure.positions.slice(i, i + 3)];
+}
+
+/** The middle of the joints on which skeletons are aligned: the pelvis, or the hips. */
+function originOf(figure, offset) {
+  const points = figure.roots.map((joint) => jointOf(figure, offset, joint));
+  return [0, 1, 2].map((axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length);
+}
+
 /** The mean place of a joint from the pelvis, m, over the modes of a time that belong to a motion, or to the others. */
 function meanPlace(layer, t, joint, identity, own) {
   const sum = [0, 0, 0, 0];
   layer.identities[t].forEach((each, rank) => {
     if ((each === identity) !== own) return;
     const weight = layer.weights[t][rank];
-    const at = (j, axis) => layer.positions[((layer.starts[t] + rank) * layer.joints.length + j) * 3 + axis];
-    [0, 1, 2].forEach((axis) => {
-      const root = layer.roots.reduce((total, j) => total + at(j, axis), 0) / layer.roots.length;
-      sum[axis] += weight * (at(joint, axis) - root);
-    });
+    const [place, origin] = [jointOf(layer, layer.starts[t] + rank, joint), originOf(layer, layer.starts[t] + rank)];
+    [0, 1, 2].forEach((axis) => { sum[axis] += weight * (place[axis] - origin[axis]); });
     sum[3] += weight;
   });
   return sum[3] > 0 ? sum.slice(0, 3).map((x) => x / sum[3]) : null;
@@ -117,7 +126,12 @@ function nameOfMotion(layer, { identity, weights }) {
 }
 layers.forEach((layer) => {
   layer.motions = motionsOf(layer);
-  layer.motionNames = new Map(layer.motions.map((motion) => [motion.identity, nameOfMotion(layer, motion)]));
+  // Names of motions that were shown: a long recording has thousands of motions.
+  const names = new Map();
+  layer.motionName = (identity) => {
+    if (!names.has(identity)) names.set(identity, nameOfMotion(layer, layer.motions.find((one) => one.identity === identity)));
+    return names.get(identity);
+  };
 });
 
 /** One skeleton at each time for which it is known, with its number or -1. */

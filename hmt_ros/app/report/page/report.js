@@ -119,7 +119,7 @@ function tellModes() {
     bar.append(made('span'));
     bar.firstChild.style.width = `${100 * weight}%`;
     row.append(first, made('td', `${(100 * weight).toFixed(1)} %`), bar);
-    if (motions) row.append(made('td', layer.motionNames.get(motions[shown.time][rank]), { class: 'motion' }));
+    if (motions) row.append(made('td', layer.motionName(motions[shown.time][rank]), { class: 'motion' }));
     if (errorsKnown()) row.append(made('td', errors ? fixed(errors[rank]) : '-'));
     return row;
   });
@@ -171,7 +171,7 @@ function tellMotions() {
   const boxes = [];
   for (let i = 0; i < layer.motions.length; i += i < TOLD_MOTIONS ? 1 : layer.motions.length) {
     const some = layer.motions.slice(i, i < TOLD_MOTIONS ? i + 1 : undefined);
-    const what = i < TOLD_MOTIONS ? layer.motionNames.get(some[0].identity) : 'all others';
+    const what = i < TOLD_MOTIONS ? layer.motionName(some[0].identity) : 'all others';
     const share = some.reduce((total, motion) => total + motion.total, 0) / sum;
     boxes.push(toggle(
       `motion-${i}`, `${what}: ${percent(share)}`, !some.every(({ identity }) => hidden.has(identity)),

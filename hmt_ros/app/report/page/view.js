@@ -71,7 +71,7 @@ class Space {
     const figure = layers[0] || truth;
     this.roots = TIMES.map((_, t) => {
       const offset = this.heaviest(figure, t);
-      return offset < 0 ? null : this.origin(figure, offset);
+      return offset < 0 ? null : originOf(figure, offset);
     });
     const include = (point) => point.forEach((x, axis) => {
       low[axis] = Math.min(low[axis], x);
@@ -83,7 +83,7 @@ class Space {
       const modes = figure === truth ? 1 : figure.weights[t].length;
       for (let rank = 0; rank < modes; rank += 1) {
         for (let joint = 0; joint < figure.joints.length; joint += 1) {
-          const point = this.joint(figure, this.heaviest(figure, t) + rank, joint);
+          const point = jointOf(figure, this.heaviest(figure, t) + rank, joint);
           include(point);
           const [dx, dy, dz] = point.map((x, axis) => x - this.roots[t][axis]);
           own = Math.max(own, Math.abs(dy), Math.hypot(dx, dz));
@@ -109,18 +109,6 @@ class Space {
       const values = roots.map((root) => root[axis]);
       return values.length > 0 && Math.max(...values) - Math.min(...values) > 1.5;
     });
-  }
-
-  /** A joint of a mode. */
-  joint(figure, offset, joint) {
-    const i = (offset * figure.joints.length + joint) * 3;
-    return [...figure.positions.slice(i, i + 3)];
-  }
-
-  /** The middle of the joints on which skeletons are aligned: the pelvis, or the hips. */
-  origin(figure, offset) {
-    const points = figure.roots.map((joint) => this.joint(figure, offset, joint));
-    return [0, 1, 2].map((axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length);
   }
 
   heaviest(figure, t) {
@@ -256,9 +244,9 @@ class Space {
     const finer = Math.min(1, width / 250);
     const root = this.lastRoot() || this.centre;
     const bodies = modesNow().filter(here).map((mode) => {
-      const own = this.origin(mode.figure, mode.offset);
+      const own = originOf(mode.figure, mode.offset);
       const place = (x, axis) => (this.together ? x + root[axis] - own[axis] : x);
-      return { ...mode, places: mode.figure.joints.map((_, joint) => this.joint(mode.figure, mode.offset, joint).map(place)) };
+      return { ...mode, places: mode.figure.joints.map((_, joint) => jointOf(mode.figure, mode.offset, joint).map(place)) };
     });
     bodies.forEach((body) => this.drawShadow(context, project, body));
     if (shown.regions) bodies.forEach((body) => this.drawRegions(context, project, body));
@@ -355,13 +343,13 @@ class Space {
     const [layer] = layers;
     if (!layer || !shown.layers.has(0) || !layer.weights[shown.time].length) return;
     const offset = layer.starts[shown.time];
-    const own = this.origin(layer, offset);
+    const own = originOf(layer, offset);
     context.strokeStyle = colour('contact');
     context.lineWidth = 2;
     Object.entries(contactsAt(shown.time)).forEach(([side, probability]) => {
       const joint = ['toe', 'ankle'].map((name) => layer.joints.indexOf(`${side}_${name}`)).find((i) => i >= 0);
       if (joint === undefined || probability < 0.05) return;
-      const point = this.joint(layer, offset, joint).map((x, axis) => (this.together ? x + root[axis] - own[axis] : x));
+      const point = jointOf(layer, offset, joint).map((x, axis) => (this.together ? x + root[axis] - own[axis] : x));
       const [u, v] = project(...point);
       context.globalAlpha = probability;
       context.beginPath();
