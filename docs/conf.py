@@ -27,10 +27,10 @@ suppress_warnings = ['ref.python']
 source_suffix = {'.rst': 'restructuredtext', '.md': 'markdown'}
 master_doc = 'index'
 html_theme = 'sphinx_rtd_theme'
-myst_heading_anchors = 4  # links lead to headings, as on the pages of a repository
+myst_heading_anchors = 4  # anchors for headings, as on GitHub pages
 exclude_patterns = ['generated']
 
-# rosdoc2 executes this text elsewhere, and knows the version itself.
+# rosdoc2 executes this file elsewhere and sets the version itself.
 _package = Path(__file__).resolve().parents[1] / 'package.xml'
 if _package.is_file():
     sys.path.insert(0, str(_package.parent))
@@ -38,12 +38,12 @@ if _package.is_file():
 
 
 def _keep_text_of_links_outside(app: Any, name: str, source: list[str]) -> None:
-    """Links to files beside docs/, which are not part of the pages, become their text."""
+    """Replaces links to files outside docs/, which are not on the pages, by their text."""
     source[0] = re.sub(r'\[([^\]]+)\]\(\.\./[^)]*\)', r'\1', source[0])
 
 
 def _as_written(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Show equations of a docstring as they are written, and take bars and stars for themselves."""
+    """Shows equations of a docstring literally, and escapes bars and stars."""
     result: list[str] = []
     literal = False
     for before, line in zip(['', *lines], lines):
@@ -59,8 +59,19 @@ def _as_written(app: Any, what: str, name: str, obj: Any, options: Any, lines: l
     lines[:] = result
 
 
+def _write_core_page(app: Any) -> None:
+    """Write the page of the compiled core beside those of the modules."""
+    sys.path.insert(0, str(app.srcdir))
+    from core_functions import core_page
+
+    folder = Path(app.srcdir) / 'api'
+    folder.mkdir(exist_ok=True)
+    (folder / 'hmt_ros.core.md').write_text(core_page(), 'utf-8')
+
+
 def setup(app: Any) -> None:
     """Called by Sphinx."""
+    app.connect('builder-inited', _write_core_page)
     app.connect('source-read', _keep_text_of_links_outside)
-    # After napoleon.
+    # Runs after napoleon.
     app.connect('autodoc-process-docstring', _as_written, priority=900)
