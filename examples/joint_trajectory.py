@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Makes a JointTrajectory for a robot of one motion of a window of the smoother.
+"""Converts one motion of the smoother's window to a JointTrajectory for a robot.
 
     python examples/joint_trajectory.py --ros-args -r __ns:=/humans/bodies/p1
 
-It takes `trajectory_mixture` (hmt_msgs/TrajectoryMixture) and publishes `joint_trajectory`
-(trajectory_msgs/JointTrajectory), the positions of its heaviest motion under the names of the URDF.
+It subscribes to `trajectory_mixture` (hmt_msgs/TrajectoryMixture) and publishes `joint_trajectory`
+(trajectory_msgs/JointTrajectory), the positions of the heaviest motion with the names of the URDF.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ def joint_trajectory(
     Args:
         messages: factory; one for ROS has the classes JointTrajectory, JointTrajectoryPoint,
             Duration, Header and Time.
-        identity: of the motion; None: the heaviest.
+        identity: identity of the motion; None selects the heaviest.
 
     Returns:
-        A message whose stamp is that of the first pose, which times count from.
+        A message with the timestamp of the first pose; its times are relative to it.
 
     Raises:
         MessageError: no trajectory has the identity.

@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
-"""Slows a robot down near people, and stops it where nothing is known.
+"""Slows a robot down near people, and stops it if their positions are unknown.
 
     python examples/keep_distance.py --ros-args -r __ns:=/humans/bodies/p1
     python examples/keep_distance.py --ros-args -p people:=true
 
-It takes `keep_out` (hmt_msgs/KeepOut) and publishes `speed_scale` (std_msgs/Float64), 10 times a
-second: 1 where the space to keep out of is `FREE` m away from the origin of its frame or more, 0
-where it is nearer than `STOP`, and 0 where the person was not seen for `UNSEEN` s or nothing comes.
-With `people`, it takes those of everybody on the list `people` of people_node: the nearest counts.
-Set `fixed_frame` of the filter, and measure from your robot in that frame, where the camera is not
-on the robot.
+It subscribes to `keep_out` (hmt_msgs/KeepOut) and publishes `speed_scale` (std_msgs/Float64), 10
+times a second: 1 if the keep-out space is at least `FREE` m away from the origin of its frame, 0 if
+it is nearer than `STOP`, and 0 if the person was not seen for `UNSEEN` s or no messages arrive.
+With `people`, it uses everybody on the list `people` of people_node; the nearest person decides.
+If the camera is not on the robot, set `fixed_frame` of the filter, and measure from your robot in
+that frame.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-STOP, FREE = 0.5, 2.0  # m
-UNSEEN, SILENCE = 0.5, 0.5  # s
+STOP, FREE = 0.5, 2.0  # distances for stopping and for full speed, m
+UNSEEN, SILENCE = 0.5, 0.5  # maximum age of an observation, and of a message, s
 
 
 def distance_to_capsules(starts: Any, ends: Any, radii: Any) -> float:
@@ -38,7 +38,7 @@ def distance_to_capsules(starts: Any, ends: Any, radii: Any) -> float:
 
 
 def speed_scale(message: Any) -> float:
-    """Share of its usual speed with which the robot may go, by an hmt_msgs/KeepOut."""
+    """Allowed share of the robot's usual speed, from an hmt_msgs/KeepOut."""
     if message.state == message.STATE_NOBODY:
         return 1.0
     known = message.state in (message.STATE_TRACKING, message.STATE_LOST)
@@ -49,11 +49,11 @@ def speed_scale(message: Any) -> float:
 
 
 class Nearest:
-    """Share of the usual speed near several people, whose messages arrive at any time.
+    """Allowed share of the usual speed near several people, whose messages are asynchronous.
 
     Attributes:
-        listed: names of the people who are there, and since when they are known, s.
-        scales: by the name of a person, the last `speed_scale`, and when it came, s.
+        listed: names of the people present, and arrival time of the list, s.
+        scales: last `speed_scale` and its arrival time, s, by person.
     """
 
     def __init__(self) -> None:
@@ -61,7 +61,7 @@ class Nearest:
         self.scales: dict[str, tuple[float, float]] = {}
 
     def scale(self, now: float) -> float:
-        """The least share; 0 where the list is old, or nothing came of somebody on it."""
+        """The minimum share; 0 if the list, or the message of a person on it, is missing or old."""
         names, since = self.listed
         new = {name: x for name, (x, at) in self.scales.items() if now - at <= SILENCE}
         if now - since > SILENCE or not new.keys() >= {*names}:
@@ -93,7 +93,7 @@ def main() -> None:
             if name not in subscribed:
                 subscribe(name, f'humans/bodies/{name}/keep_out')
         for name in [*subscribed]:
-            # Somebody who has left is known for some seconds.
+            # A person who has left is published for some seconds.
             if name not in message.ids and not node.count_publishers(subscribed[name].topic_name):
                 node.destroy_subscription(subscribed.pop(name))
 

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Turns the space to keep out of into a grid of obstacles, such as a costmap of Nav2 takes.
+"""Converts the keep-out space into a grid of obstacles, for example for a costmap of Nav2.
 
     python examples/keep_out_grid.py --ros-args -r __ns:=/humans/bodies/p1
 
-It takes `keep_out` (hmt_msgs/KeepOut) and publishes `keep_out_grid` (nav_msgs/OccupancyGrid), 10
-times a second: cells of `AREA` are 100 where a capsule is above them, at any height, and 0
-elsewhere. All are 100 where the person was not seen for `UNSEEN` s or nothing comes. The filter
-needs `fixed_frame` and `publish_in_fixed_frame`, because a grid lies in a frame whose z points up.
+It subscribes to `keep_out` (hmt_msgs/KeepOut) and publishes `keep_out_grid`
+(nav_msgs/OccupancyGrid), 10 times a second: cells of `AREA` are 100 below a capsule at any height,
+and 0 elsewhere. All are 100 if the person was not seen for `UNSEEN` s or no messages arrive. The
+filter needs `fixed_frame` and `publish_in_fixed_frame`, because a grid needs a frame with z up.
 
 In a rolling costmap of Nav2, name the layer before others: it overwrites what came before.
 
@@ -25,13 +25,13 @@ from typing import Any
 import numpy as np
 
 FRAME = 'odom'
-AREA, CELL = (-5.0, -5.0, 5.0, 5.0), 0.05  # least x and y, greatest x and y, and side of a cell, m
-UNSEEN, SILENCE = 0.5, 0.5  # s
+AREA, CELL = (-5.0, -5.0, 5.0, 5.0), 0.05  # minimum x and y, maximum x and y, and side of a cell, m
+UNSEEN, SILENCE = 0.5, 0.5  # maximum age of an observation, and of a message, s
 FREE, OCCUPIED = 0, 100
 
 
 def shadows(starts: Any, ends: Any, radii: Any) -> Any:
-    """Cells under capsules, (rows along y, columns along x), true where a capsule touches one."""
+    """Mask of the cells below capsules (rows along y, columns along x)."""
     x, y = (np.arange(AREA[k] + CELL / 2, AREA[k + 2], CELL) for k in (0, 1))
     under = np.zeros((len(y), len(x)), bool)
     corner = CELL * math.sqrt(0.5)
@@ -49,7 +49,7 @@ def shadows(starts: Any, ends: Any, radii: Any) -> Any:
 
 
 def occupancy(message: Any) -> Any:
-    """Values of all cells (rows, columns), by an hmt_msgs/KeepOut."""
+    """Values of all cells (rows, columns), from an hmt_msgs/KeepOut."""
     known = message.state in (message.STATE_TRACKING, message.STATE_LOST)
     nobody = message.state == message.STATE_NOBODY
     under = shadows(message.starts, message.ends, message.radii)

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Tells social costmaps where the person is, and where the person goes.
+"""Publishes position and velocity of the person for social costmaps.
 
     python examples/people_for_costmaps.py --ros-args -r __ns:=/humans/bodies/p1
 
-It takes `pose_mixture` (hmt_msgs/PoseMixture) and publishes `people` (people_msgs/People): pelvis
-of the heaviest mode, its velocity, and the probability of all modes within `THERE` of it; nobody
-where the track is lost. No distribution of ROS 2 has people_msgs: build it from source.
+It subscribes to `pose_mixture` (hmt_msgs/PoseMixture) and publishes `people` (people_msgs/People):
+the pelvis of the heaviest mode, its velocity, and the probability of all modes within `THERE` of
+it; nobody if the track is lost. No distribution of ROS 2 has people_msgs; build it from source.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import contextlib
 import math
 from typing import Any
 
-THERE = 0.5  # m
+THERE = 0.5  # maximum distance of a mode that counts for the position, m
 
 
 def people(mixture: Any, message: Any, person: Any) -> Any:
-    """The people_msgs/People of an hmt_msgs/PoseMixture, with its classes People, Person."""
+    """The people_msgs/People of an hmt_msgs/PoseMixture, given the classes People and Person."""
     result = message(header=mixture.header)
     if mixture.state == mixture.STATE_TRACKING:
         pelvis, best = mixture.joint_names.index('pelvis'), mixture.components[0]

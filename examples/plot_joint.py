@@ -3,8 +3,8 @@
 
     python examples/plot_joint.py build/demo/reach -o height.png --joint right_wrist
 
-Every mode is a dot, the darker the more probable; the line is the mean over all modes, the band two
-standard deviations. Heights are above the pelvis, along the y axis of the image.
+Every mode is a dot, darker if more probable; the line is the mean over all modes, the band two
+standard deviations. Heights are relative to the pelvis, along the y axis of the image.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ BAND, LINE = (235, 215, 190), (160, 90, 20)
 def heights(
     bag: Path, joint: str, topic: str
 ) -> tuple[list[float], list[Any], list[Any], list[Any]]:
-    """Time, s, and of all modes heights, variances and weights, of each image."""
+    """Time, s, and heights, variances and weights of all modes, for each image."""
     times: list[float] = []
     places: list[Any] = []
     variances: list[Any] = []
@@ -87,7 +87,7 @@ def draw(
 
 
 def text(picture: Any, words: str, place: tuple[int, int]) -> None:
-    """Writes words."""
+    """Writes text into the picture."""
     cv2.putText(picture, words, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (60,) * 3, 1, cv2.LINE_AA)
 
 

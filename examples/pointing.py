@@ -1,14 +1,13 @@
 #!/usr/bin/env python3
-"""Tells at which of some objects a person points, with a probability for each, and for none.
+"""Estimates at which object a person points, as probabilities of each object and of none.
 
     python examples/pointing.py --ros-args -r __ns:=/humans/bodies/p1 \
         -p objects:="[0.5, 0.2, 2.0, -0.8, 0.2, 2.5]" -p side:=right
 
-It takes `pose_mixture` (hmt_msgs/PoseMixture) and publishes `pointing`
-(std_msgs/Float64MultiArray): the probabilities of the objects, whose places are x, y, z in the
-frame of the mixture, m, and last that of none; all NaN where nobody is tracked. A forearm that
-points towards the camera looks like one that points away: where both are modes, both objects keep
-their share.
+It subscribes to `pose_mixture` (hmt_msgs/PoseMixture) and publishes `pointing`
+(std_msgs/Float64MultiArray): the probabilities of the objects, given by x, y, z in the frame of the
+mixture, m, and last that of none; all are NaN if nobody is tracked. A forearm that points towards
+the camera looks like one that points away; if both are modes, both objects keep a probability.
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
-# Angle by which people miss what they point at, rad.
+# Standard deviation of people's pointing direction, rad.
 MISS = math.radians(10.0)
 
 
 def pointing(mixture: Any, objects: Any, side: str = 'right') -> list[float]:
-    """The probabilities (N + 1,) by an hmt_msgs/PoseMixture and places (N, 3)."""
+    """The probabilities (N + 1,), from an hmt_msgs/PoseMixture and object positions (N, 3)."""
     places = np.reshape(np.asarray(objects, dtype=float), (-1, 3))
     if mixture.state != mixture.STATE_TRACKING:
         return [math.nan] * (len(places) + 1)
@@ -37,13 +36,13 @@ def pointing(mixture: Any, objects: Any, side: str = 'right') -> list[float]:
         forearm = wrist - elbow
         length = max(float(np.linalg.norm(forearm)), 1e-6)
         told = np.reshape(mode.joint_covariances_relative, (-1, 3, 3))
-        # Of the direction: what is not known of both joints, across the forearm.
+        # Variance of the direction, with that of both joints perpendicular to the forearm.
         across = np.eye(3) - np.outer(forearm, forearm) / length**2
         variance = MISS**2 + np.trace(across @ told[joints].sum(0)) / (2.0 * length**2)
         away = places - wrist
         cosines = away @ forearm / (np.maximum(np.linalg.norm(away, axis=1), 1e-6) * length)
         angles = np.arccos(np.clip(cosines, -1.0, 1.0))
-        # Densities over directions: about each object, and of none everywhere.
+        # Densities over directions: a Gaussian for each object, uniform for none.
         each = np.exp(-0.5 * angles**2 / variance) / (2.0 * math.pi * variance)
         shares = np.append(each, 1.0 / (4.0 * math.pi))
         total += mode.weight * shares / shares.sum()

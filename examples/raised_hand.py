@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""Tells how probable it is that a hand is above the head.
+"""Publishes the probability that a hand is above the head.
 
     python examples/raised_hand.py --ros-args -r __ns:=/humans/bodies/p1
 
-It takes `pose_mixture` (hmt_msgs/PoseMixture) and publishes `raised_hand` (std_msgs/Float64), the
-probability over all modes; NaN where nobody is tracked. Up is taken to be the y axis of the image,
-upside down: for a camera that is not level turn the positions first (`docs/consumers.md`, frames).
+It subscribes to `pose_mixture` (hmt_msgs/PoseMixture) and publishes `raised_hand`
+(std_msgs/Float64), the probability over all modes; NaN if nobody is tracked. Up is assumed to be
+against the y axis of the image; if the camera is not level, rotate the positions first
+(`docs/consumers.md`, frames).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ HANDS, HEAD = ('left_wrist', 'right_wrist'), 'head'
 
 
 def raised_hand(mixture: Any) -> float:
-    """The probability, by an hmt_msgs/PoseMixture."""
+    """The probability, from an hmt_msgs/PoseMixture."""
     if mixture.state != mixture.STATE_TRACKING:
         return math.nan
     head = mixture.joint_names.index(HEAD)

@@ -3,10 +3,10 @@
 
     python examples/stop_near_hand.py --ros-args -r __ns:=/humans/bodies/p1
 
-It takes `pose_mixture` (hmt_msgs/PoseMixture) and publishes `stop` (std_msgs/Bool), 10 times a
-second: true where a hand is within `NEAR` m of the origin of its frame with a probability of at
-least `DOUBT`, and where the person is not seen or no mixture came for `SILENCE` s. To measure from
-an arm, set `fixed_frame` of the filter to a frame that begins there, and `publish_in_fixed_frame`.
+It subscribes to `pose_mixture` (hmt_msgs/PoseMixture) and publishes `stop` (std_msgs/Bool), 10
+times a second: true if a hand is within `NEAR` m of the origin of its frame with a probability of
+at least `DOUBT`, if the person is not tracked, or if no mixture arrived for `SILENCE` s. To measure
+from an arm, set `fixed_frame` of the filter to a frame there, and `publish_in_fixed_frame`.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import math
 import time
 from typing import Any
 
-NEAR, DOUBT = 0.8, 0.05  # m, probability
-SILENCE = 0.5  # s
-HAND = ('wrist', 'hand')  # how names of points of a hand end
+NEAR, DOUBT = 0.8, 0.05  # distance, m; probability for stopping
+SILENCE = 0.5  # maximum age of a message, s
+HAND = ('wrist', 'hand')  # ends of the names of points of a hand
 
 
 def hand_near(mixture: Any, near: float = NEAR) -> float:
-    """Probability that a hand is nearer to the origin, by an hmt_msgs/PoseMixture; NaN: unknown."""
+    """Probability that a hand is within `near`, from an hmt_msgs/PoseMixture; NaN if unknown."""
     points = [j for j, name in enumerate(mixture.joint_names) if name.endswith(HAND)]
     total = 0.0 if points and mixture.components else math.nan
     for mode in mixture.components:
@@ -33,7 +33,7 @@ def hand_near(mixture: Any, near: float = NEAR) -> float:
             place = mode.joint_positions[j]
             p = (place.x, place.y, place.z)
             distance = max(math.hypot(*p), 1e-9)
-            # Along the line to the origin the covariance is that of the distance.
+            # The variance of the distance is that along the line to the origin.
             c = mode.joint_covariances[9 * j : 9 * j + 9]
             variance = sum(p[a] * c[3 * a + b] * p[b] for a in range(3) for b in range(3))
             sigma = math.sqrt(max(variance, 1e-12)) / distance
@@ -43,7 +43,7 @@ def hand_near(mixture: Any, near: float = NEAR) -> float:
 
 
 def must_stop(mixture: Any) -> bool:
-    """Whether to stop, by an hmt_msgs/PoseMixture; true unless it shows that no hand is near."""
+    """Whether to stop, from an hmt_msgs/PoseMixture; true unless it shows that no hand is near."""
     if mixture.state == mixture.STATE_NOBODY:
         return False
     return mixture.state != mixture.STATE_TRACKING or not hand_near(mixture) < DOUBT

@@ -1,8 +1,7 @@
-"""The programs in examples/: what they tell, and that they run."""
+"""The programs in examples/: their results, and that they run."""
 
 from __future__ import annotations
 
-import json
 import math
 import runpy
 import subprocess
@@ -12,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -45,15 +43,13 @@ def example(name):
 
 def test_the_readme_names_every_example():
     text = (EXAMPLES / 'README.md').read_text('utf-8')
-    programs = [
-        path.name for path in EXAMPLES.iterdir() if path.suffix in ('.py', '.cpp', '.ipynb')
-    ]
-    assert len(programs) == 10
+    programs = [path.name for path in EXAMPLES.iterdir() if path.suffix in ('.py', '.cpp')]
+    assert len(programs) == 9
     assert all(f'`{name}`' in text for name in programs)
 
 
 def keep_out(state, away=1.5, unseen=0.0, frame='eye'):
-    """Somebody `away` m from the origin, if anybody is known."""
+    """Message of a person `away` m from the origin, if the state has one."""
     some = state not in (KeepOutState.NOBODY, KeepOutState.UNKNOWN)
     starts, ends = np.array([[-1.0, 0.0, away + 0.25]]), np.array([[1.0, 0.0, away + 0.25]])
     none = np.empty((0, 3))
@@ -94,7 +90,7 @@ def test_the_nearest_of_several_people_counts():
     assert nearest.scale(10.3) == 0.0
     nearest.scales['p2'] = 0.4, 10.2
     assert nearest.scale(10.3) == 0.4
-    # Somebody who is not on the list any more counts for as long as messages come.
+    # A person no longer on the list counts as long as messages arrive.
     nearest.listed = ['p1'], 10.4
     assert nearest.scale(10.5) == 0.4
     nearest.scales['p1'] = 0.7, 10.8
@@ -104,7 +100,7 @@ def test_the_nearest_of_several_people_counts():
 
 
 def mixture(*heights, weights=(0.75, 0.25)):
-    """Modes whose right wrist is so far above the head, m, with a deviation of 0.05 m each."""
+    """Modes with the right wrist at these heights above the head, m, with deviations of 0.05 m."""
     names = ('head', 'left_wrist', 'right_wrist')
     places = [SimpleNamespace(y=0.0), SimpleNamespace(y=0.9)]
     modes = [
@@ -123,7 +119,7 @@ def test_a_raised_hand_is_as_probable_as_its_modes():
     assert told(mixture(0.5, 0.5)) == pytest.approx(1.0, abs=1e-6)
     assert told(mixture(0.5, -0.5)) == pytest.approx(0.75, abs=1e-6)
     assert told(mixture(0.0, -0.5)) == pytest.approx(0.375, abs=1e-6)
-    # One deviation of the difference of two joints.
+    # One standard deviation of the difference of two joints.
     one = 0.05 * math.sqrt(2.0)
     assert told(mixture(one, one)) == pytest.approx(0.8413, abs=1e-4)
     nobody = mixture(0.5, 0.5)
@@ -154,7 +150,7 @@ def test_a_forearm_that_points_both_ways_leaves_both_objects_their_share():
     assert both[:2] == pytest.approx([0.7, 0.3], abs=0.02)
     assert sum(both) == pytest.approx(1.0)
     assert told(pointed((0.0, 0.25, 3.0), weights=(1.0,)), objects)[-1] > 0.99
-    # An arm that is hardly known points at none for sure.
+    # A very uncertain arm points at no object with certainty.
     vague = told(pointed(near, weights=(1.0,), deviation=0.3), objects)
     assert told(pointed(near, weights=(1.0,)), objects)[0] > vague[0] > vague[1]
     nobody = pointed(near, far)
@@ -164,7 +160,7 @@ def test_a_forearm_that_points_both_ways_leaves_both_objects_their_share():
 
 
 class StandIn(SimpleNamespace):
-    """A message of people_msgs, which no distribution of ROS 2 has."""
+    """Stand-in for messages of people_msgs, which no distribution of ROS 2 has."""
 
     def __init__(self, **fields):
         super().__init__(people=[], velocity=SimpleNamespace(x=0.0, y=0.0, z=0.0), **fields)
@@ -233,7 +229,7 @@ def test_an_arm_stops_while_a_hand_may_be_near():
     assert not must_stop(hands(TrackState.TRACKING, 0.8779))
     assert must_stop(hands(TrackState.TRACKING, 0.8064))
     assert must_stop(hands(TrackState.TRACKING, math.nan))
-    # Without hands, modes or covariances it does not show that no hand is near.
+    # Without hands, modes or covariances a hand may be near.
     without_hands, without_modes = hands(TrackState.TRACKING, 9.0), hands(TrackState.TRACKING, 9.0)
     without_covariances = hands(TrackState.TRACKING, 9.0)
     without_hands.joint_names[1:] = ['left_knee', 'left_ankle']
@@ -268,7 +264,7 @@ def demonstration(tmp_path_factory):
 
 
 def test_raised_hands_are_seen(tmp_path):
-    """Of somebody who has a hand above the head in 12 of 60 images."""
+    """A person has a hand above the head in 12 of 60 images."""
     with BagReader(tracked('reach', tmp_path)) as bag:
         mixtures = [x.message for x in bag.messages(['pose_mixture'])]
     with np.load(ROOT / 'bags' / 'reach' / 'truth.npz') as truth:
@@ -281,7 +277,7 @@ def test_raised_hands_are_seen(tmp_path):
 
 
 def test_examples_tell_what_the_demonstration_shows(demonstration):
-    """Of somebody 3 to 4 m away who points at the camera, then aside, and goes out of view."""
+    """A person 3 to 4 m away points at the camera, then aside, and leaves the view."""
     with np.load(ROOT / 'bags' / 'living_room' / 'truth.npz') as truth:
         names, stamps, until = list(truth['joint_names']), truth['stamps'], truth['until']
         positions = dict(zip(stamps.tolist(), truth['joints']))
@@ -297,7 +293,7 @@ def test_examples_tell_what_the_demonstration_shows(demonstration):
     raised = example('raised_hand')['raised_hand']
     assert sum(raised(x) > 0.5 for x in seen) <= 1
     pointing = example('pointing')['pointing']
-    # At what is a metre beyond the true hand, along the true forearm; at its mirror image.
+    # Objects: one metre beyond the true hand along the true forearm, and its mirror image.
     elbow = joints[:, names.index('right_elbow')]
     forearm = hands[:, 1] - elbow
     beyond = hands[:, 1] + forearm / np.linalg.norm(forearm, axis=1, keepdims=True)
@@ -320,34 +316,13 @@ def test_examples_tell_what_the_demonstration_shows(demonstration):
     assert np.abs(np.array(found) - true).mean() < 0.1
 
 
-def test_the_notebook_runs_from_its_first_cell_to_its_last(monkeypatch, capsys):
-    """As it is saved, without results: its code in order."""
-    content = json.loads((EXAMPLES / 'library.ipynb').read_text('utf-8'))
-    cells = [cell for cell in content['cells'] if cell['cell_type'] == 'code']
-    assert content['nbformat'] == 4
-    assert not any(cell['outputs'] or cell['execution_count'] for cell in cells)
-    monkeypatch.setenv('MPLBACKEND', 'Agg')
-    plt.switch_backend('Agg')
-    monkeypatch.chdir(EXAMPLES)
-    names = {}
-    for number, cell in enumerate(cells):
-        exec(compile(''.join(cell['source']), f'cell {number}', 'exec'), names)
-    # Each mode has four limbs on each picture, and the truth has four on one.
-    drawn = [len(axes.lines) for axes in (names['picture'], names['above'])]
-    plt.close('all')
-    count = len(names['posterior'].weights)
-    assert drawn == [4 * count, 4 * count + 4]
-    assert names['best'] <= names['heaviest'] < 0.1
-    assert f'{count} modes: heaviest' in capsys.readouterr().out
-
-
 def python(name):
     return [sys.executable, EXAMPLES / f'{name}.py']
 
 
 @pytest.fixture(scope='module')
 def standing():
-    """Messages on topics of somebody who stands 3 m away, or lies 1.25 m away."""
+    """Publishes messages of a person who stands 3 m away, or lies 1.25 m away."""
     body = load_body('human37')
     pose = body.prior_mean[None].copy()
     pose[:, 2] = 3.0
@@ -364,7 +339,7 @@ def standing():
 
 
 def check_answers(standing, programs):
-    """All programs at once, each in a namespace and a process of its own.
+    """Checks all programs at once, each in its own namespace and process.
 
     `programs` has by name the command, the topic that it takes, the topic that it publishes with
     its type, and the answer.
