@@ -20,38 +20,38 @@ MESSAGES = 'hmt_msgs'
 
 
 def files(folder: str, pattern: str) -> list[str]:
-    """Files of a folder as setuptools wants them: relative to this file, in a fixed order."""
+    """Files of a folder for setuptools, with paths relative to this file, in a fixed order."""
     return sorted(str(path.relative_to(ROOT)) for path in (ROOT / folder).glob(pattern))
 
 
 def nodes() -> list[str]:
-    """Entry points of the nodes: every file NAME_node.py of hmt_ros/nodes that has a `main`."""
+    """Entry points of the nodes: every file NAME_node.py of hmt_ros/nodes with a `main`."""
     paths = (ROOT / PACKAGE / 'nodes').glob('*_node.py')
     names = sorted(path.stem for path in paths if 'def main(' in path.read_text('utf-8'))
     return [f'{name} = {PACKAGE}.nodes.{name}:main' for name in names]
 
 
 def commands() -> list[str]:
-    """Entry points of the commands: the table COMMANDS of hmt_ros/app, which is not imported."""
+    """Entry points of the commands, from the table COMMANDS of hmt_ros/app, without importing."""
     module = ast.parse((ROOT / PACKAGE / 'app' / '__init__.py').read_text('utf-8'))
     assigned = [x for x in module.body if isinstance(x, ast.Assign)]
     (table,) = (x.value for x in assigned if ast.unparse(x.targets[0]) == 'COMMANDS')
     return [f'{name} = {found[0]}:main' for name, found in ast.literal_eval(table).items()]
 
 
-# Whether pip builds a wheel, which has the library and the offline commands; colcon builds none.
+# Whether pip builds a wheel (library and offline commands only); colcon does not build wheels.
 WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel'}.isdisjoint(sys.argv)
 
 
 def opencv() -> list[str]:
-    """OpenCV as a requirement of a wheel, unless the environment of pip has one.
+    """OpenCV as a requirement of a wheel, unless the environment of pip already has it.
 
-    Its distributions (apt, opencv-python, -headless, -contrib) hold one module: a second one would
-    overwrite the first.
+    All distributions of OpenCV (apt, opencv-python, -headless, -contrib) install the same module,
+    so that a second distribution would overwrite the first.
     """
     if not WHEEL:
         return []
-    # pip builds in an environment of its own, by these variables.
+    # pip isolates its build environment with these variables; this looks at the user's environment.
     hidden = ('PYTHONPATH', 'PYTHONNOUSERSITE')
     environment = {name: value for name, value in os.environ.items() if name not in hidden}
     program = 'import importlib.util as u; raise SystemExit(u.find_spec("cv2") is None)'
@@ -59,11 +59,11 @@ def opencv() -> list[str]:
     return ['opencv-python-headless'] if done.returncode else []
 
 
-# No fused products: every processor rounds alike. Without errno and traps loops become vectors, and
-# those marked by "omp simd" do.
+# Without fused multiply-add, every processor rounds in the same way. Without errno and traps, and
+# with "omp simd", the compiler can vectorise loops.
 CORE_OPTIONS = ['-std=c++20', '-O3', '-ffp-contract=off', '-fno-math-errno', '-fno-trapping-math']
 CORE_OPTIONS += ['-fvisibility=hidden', '-fopenmp-simd']
-# What the core is compiled with: condition of the preprocessor, what is missing, package of apt.
+# Requirements of the core: condition of the preprocessor, name of the requirement, apt package.
 CORE_NEEDS = [
     ('__cplusplus >= 202002L', 'compiler for C++20 (g++ 11, clang++ 14 or later)', 'g++'),
     ('__has_include(<Python.h>)', 'Python.h', 'python3-dev'),
@@ -72,7 +72,7 @@ CORE_NEEDS = [
 
 
 def core() -> Extension:
-    """The compiled core: the sources of hmt_ros/core, which include its headers."""
+    """The extension module of the compiled core, from the sources in hmt_ros/core."""
     folder = f'{PACKAGE}/core'
     return Extension(
         f'{PACKAGE}.core._compiled',
@@ -84,9 +84,10 @@ def core() -> Extension:
 
 
 class BuildCore(build_ext):
-    """``build_ext`` that compiles files at the same time, and only those that have changed.
+    """``build_ext`` that compiles files in parallel, and only files that have changed.
 
-    The headers of pybind11 are those of Python or of the system. ``--debug`` is for debuggers.
+    The headers of pybind11 come from its Python package or from the system. ``--debug`` compiles
+    for debuggers.
     """
 
     def build_extension(self, ext: Extension) -> None:
@@ -117,8 +118,8 @@ class BuildCore(build_ext):
         super().build_extension(ext)
 
     def expect_compiler(self) -> None:
-        """Stop with one line where something is missing that the core is compiled with."""
-        # Older setuptools compiles C++ by the name of the compiler of C.
+        """Exit with a one-line error if a requirement of the core is missing."""
+        # Older versions of setuptools compile C++ with the command of the C compiler.
         compiler = getattr(self.compiler, 'compiler_so_cxx', self.compiler.compiler_so)
         folders = [f'-I{folder}' for folder in self.compiler.include_dirs]
         command = [*compiler, *folders, CORE_OPTIONS[0], '-E', '-P', '-x', 'c++', '-']
@@ -139,22 +140,22 @@ class BuildCore(build_ext):
 
 
 def is_older(target: str, sources: list[str]) -> bool:
-    """Whether a file is missing, or older than one of those that it is made of."""
+    """Whether a file is missing, or older than one of its sources."""
     made = Path(target).stat().st_mtime if Path(target).is_file() else -1.0
     return any(Path(source).stat().st_mtime > made for source in sources)
 
 
 def processes() -> int:
-    """How many processes compile at the same time: as MAKEFLAGS says, or one on each processor."""
+    """Number of parallel compilations: from MAKEFLAGS or, without it, one per processor."""
     found = re.search(r'-j ?(\d+)', os.environ.get('MAKEFLAGS', ''))
     return int(found[1]) if found else os.cpu_count() or 1
 
 
 class Install(install):
-    """``install``, and the messages with it; into the prefix that colcon or bloom gives."""
+    """``install`` that also installs the messages, into the prefix given by colcon or bloom."""
 
     def finalize_options(self) -> None:
-        """Note whether a prefix was given, before the default replaces none."""
+        """Record whether a prefix was given, before the default is filled in."""
         self.prefix_is_given = self.prefix is not None
         super().finalize_options()
 
@@ -169,7 +170,7 @@ class Install(install):
 
 
 class Develop(develop):
-    """``develop``, and the messages with it, for ``colcon build --symlink-install``."""
+    """``develop`` that also installs the messages, for ``colcon build --symlink-install``."""
 
     def run(self) -> None:
         """Install hmt_msgs, then hmt_ros."""
@@ -181,7 +182,7 @@ class Develop(develop):
 
 
 def in_colcon(prefix: Path) -> bool:
-    """Whether colcon installs into this folder, alone or together with other packages."""
+    """Whether colcon installs into this folder, either isolated or merged with other packages."""
     return not WHEEL and any(
         (x / '.colcon_install_layout').is_file() for x in (prefix, prefix.parent)
     )
@@ -190,12 +191,12 @@ def in_colcon(prefix: Path) -> bool:
 def install_messages(build: Path, prefix: Path, root: str) -> None:
     """Build and install hmt_msgs, unless the ROS environment has it with the same definitions.
 
-    colcon and bloom do not look for packages inside a package, so that they find hmt_ros only.
+    colcon and bloom do not look for packages inside a package, so they find only hmt_ros.
 
     Args:
         build: Folder for the files of CMake.
-        prefix: Folder of the installation, as it is called when the package is in use.
-        root: Folder that stands for ``/`` while a Debian package is made; empty for none.
+        prefix: Installation folder, with the path that it has when the package is used.
+        root: Folder that replaces ``/`` while a Debian package is built; empty: no replacement.
     """
     built_before = (build / 'CMakeCache.txt').is_file()
     if not built_before and messages_are_there():
@@ -206,10 +207,10 @@ def install_messages(build: Path, prefix: Path, root: str) -> None:
             '/opt/ros/jazzy/setup.bash" and then the same command'
         )
     environment = dict(os.environ, DESTDIR=root)
-    # As colcon does for a package of CMake: all processors, unless the user says how many.
+    # Like colcon for CMake packages: uses all processors, unless the user sets a number.
     if 'MAKEFLAGS' not in environment:
         environment.setdefault('CMAKE_BUILD_PARALLEL_LEVEL', str(os.cpu_count() or 1))
-    # What colcon adds for setup.py moves sys.prefix, which CMake would ask for.
+    # colcon adds folders for setup.py that change sys.prefix, which CMake would read.
     folders = environment.get('PYTHONPATH', '').split(os.pathsep)
     ours = ('prefix_override', 'colcon_distutils_commands')
     environment['PYTHONPATH'] = os.pathsep.join(x for x in folders if Path(x).name not in ours)
@@ -256,7 +257,7 @@ setup(
     license='Apache-2.0',
     license_files=['LICENSE', 'LICENSES/*'],
     author='hmt_ros contributors',
-    url='https://example.com/hmt_ros',  # stands for a public address, as in package.xml
+    url='https://example.com/hmt_ros',  # placeholder, as in package.xml
     maintainer='hmt_ros maintainers',
     maintainer_email='hmt-ros@example.com',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*', 'msg_tools', 'msg_tools.*']),
@@ -270,7 +271,7 @@ setup(
             'image/*.yaml',
             'app/report/page/*',
         ],
-        # The message definitions are also read without ROS, by those who work on bags.
+        # Tools for bags read the message definitions without ROS.
         'msg_tools': ['hmt_msgs/msg/*.msg', 'hmt_msgs/srv/*.srv'],
     },
     data_files=[
@@ -306,7 +307,7 @@ setup(
     extras_require={
         'test': ['pytest', 'hypothesis'],
         'dask': ['distributed'],
-        # What hmt_learning, which is not installed, imports beside the requirements above.
+        # Additional requirements of hmt_learning, which is not installed itself.
         'learning': ['jax', 'optax'],
         'detector': ['ai-edge-litert'],
         'video': ['av'],
@@ -315,7 +316,7 @@ setup(
     ext_modules=[core()],
     cmdclass={'build_ext': BuildCore, 'install': Install, 'develop': Develop},
     entry_points={
-        # "ros2 run" finds each program by its name; pip would put all these names into PATH.
+        # "ros2 run" finds each program by its name; pip would put all of them into PATH.
         'console_scripts': [f'{PACKAGE} = {PACKAGE}.app:main']
         if WHEEL
         else [*nodes(), *commands()],

@@ -17,7 +17,7 @@ Without a name all of them run. Every benchmark takes --json, --quick and --help
 
 
 def main(argv: list[str]) -> int:
-    """Runs one benchmark, or all; the exit code is that of the first that fails."""
+    """Runs one benchmark or all; returns the exit code of the first that fails."""
     if argv and argv[0] in ('-h', '--help'):
         width = max(map(len, BENCHMARKS))
         lines = [f'  {name:{width}}  {what}' for name, what in BENCHMARKS.items()]

@@ -1,8 +1,8 @@
-"""absence: whether a visible person is ever taken for nobody, and an empty scene for somebody.
+"""absence: whether the tracker misses a visible person or tracks somebody in an empty scene.
 
-Real videos of a place that is empty, then visited. No track may start while it is empty; 1 s after
-somebody has left, the state has to be NOBODY. With images alone a box in the empty place starts a
-track, which has to end within 1 s.
+Real videos show an empty scene that is then visited. No track is allowed to start while it is
+empty; 1 s after the person has left, the state must be NOBODY. With images alone, a box in the
+empty scene starts a track, which must end within 1 s.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from msg_tools.messages.camera_info import camera_from_info
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import decode_image
 
-RATES = (10.0, 2.7)  # images a second
-LATE = 1.0  # s after which it has to be noticed
+RATES = (10.0, 2.7)  # images per second
+LATE = 1.0  # maximum time until absence is noticed, s
 Case = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A real video of a place that somebody visits.
+    """A real video of a scene that a person visits.
 
     Attributes:
-        name: of its folder.
-        empty: first and last image but one of the times without anybody.
-        whole: the same of the times at which the person is in full view.
+        name: name of the folder.
+        empty: ranges of images, end excluded, without a person.
+        whole: ranges of images, end excluded, with the person in full view.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Scene:
     whole: tuple[tuple[int, int], ...]
 
 
-# As seen by eye. A second person comes into `park_walk` after these images.
+# Annotated by eye. A second person enters `park_walk` after these images.
 SCENES = (
     Scene('park_walk', ((0, 33),), ((64, 174),)),
     Scene('leaflet', ((0, 59), (200, 226)), ((72, 190),)),
@@ -78,13 +78,13 @@ def measure(
     """Counts of wrong states by inputs, video and rate.
 
     Args:
-        clips: folder of the videos; None: that of the development data.
-        rates: of the images, Hz.
-        inputs: what the tracker is given, some of `INPUTS`.
-        quick: whether one of each is enough.
+        clips: folder of the videos; None means that of the development data.
+        rates: image rates, Hz.
+        inputs: inputs of the tracker, some of `INPUTS`.
+        quick: one video, one rate, images alone.
 
     Raises:
-        FileNotFoundError: the videos are not there.
+        FileNotFoundError: the videos are missing.
     """
     scenes = SCENES
     if quick:
@@ -101,7 +101,7 @@ def measure(
 
 
 def count_scene(folder: Path, scene: Scene, rate: float, *, inputs: str = IMAGES) -> Case:
-    """States of a real video of a place that is empty at first."""
+    """Counts the states in a real video of a scene that is empty at first."""
     info, messages = read_messages(folder)
     stamps = [time_ns(message.header.stamp) for message in messages]
     first = decode_image(messages[0])
@@ -128,10 +128,10 @@ def count_scene(folder: Path, scene: Scene, rate: float, *, inputs: str = IMAGES
 
 
 class Counts:
-    """Counts of states: of images of the person, and of the late ones of the empty scene.
+    """Counts of states in images of the person, and in late images of the empty scene.
 
     Args:
-        tracks: number of tracks that are started on purpose.
+        tracks: number of tracks started on purpose.
     """
 
     def __init__(self, tracks: int = 0) -> None:
@@ -140,7 +140,7 @@ class Counts:
         self._tracks, self._started = tracks, 0
 
     def add(self, tracker: Tracker, t: float, *, here: bool, empty: bool) -> None:
-        """Counts the state at a time t, s, at which the person is in view, or nobody is."""
+        """Counts the state at time t, s, given whether the person is in view or the scene empty."""
         if empty:
             self._started += max(tracker.track_id - self._tracks, 0)
         self._tracks = max(tracker.track_id, self._tracks)
@@ -164,7 +164,7 @@ class Counts:
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """A table of what `measure` has counted, summed over the videos."""
+    """Human-readable table of the counts, summed over the videos."""
     kinds: dict[tuple[str, float], list[Case]] = {}
     for case in result['scenes']:
         kinds.setdefault((case['inputs'], case['rate']), []).append(case)

@@ -1,4 +1,4 @@
-"""bags: what replay adds to the time of the estimate."""
+"""bags: time that replay adds to the estimate."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from hmt_ros.smoothing import SlidingWindow
 from hmt_ros.tracking import Tracker
 from msg_tools import BagReader
 
-MOST_ADDED = 0.1  # of the time of the estimate
-# What estimates: all else that replay does is added by it.
+MOST_ADDED = 0.1  # maximum added time, relative to the time of the estimate
+# Functions that estimate; all other time is added by replay.
 ESTIMATE = 'estimate'
 ESTIMATORS: Stages = (
     (Tracker, 'step', ESTIMATE),
@@ -38,13 +38,13 @@ def main(argv: list[str]) -> int:
 
 
 def measure(*, quick: bool = False) -> dict[str, Any]:
-    """What replay adds, on bags in a temporary folder."""
+    """Time that replay adds, with bags in a temporary folder."""
     with tempfile.TemporaryDirectory(prefix='benchmark_bags.') as name:
         return {'machine': description(), 'replay': replayed(Path(name), quick=quick)}
 
 
 def replayed(folder: Path, *, quick: bool = False) -> list[dict[str, Any]]:
-    """What replay adds to the time of the estimate, with and without smoother and BME."""
+    """Time that replay adds to the estimate, with and without smoother and BME."""
     source = ROOT / 'bags' / 'reach' if quick else find_clips(None)[0][-1]
     background = ['--background', str(source / 'background.png')]
     person = ['--subject', str(source / 'subject.yaml'), *background]
@@ -56,7 +56,7 @@ def replayed(folder: Path, *, quick: bool = False) -> list[dict[str, Any]]:
     if quick:
         ways = {'filter': ways['filter']}
     else:
-        # What is read lies in the cache of files.
+        # A first run fills the file cache.
         _run(source, folder / 'first', ways['filter, smoother and BME'])
     found = []
     for number, (what, options) in enumerate(ways.items()):
@@ -90,7 +90,7 @@ def _run(source: Path, target: Path, options: list[str]) -> None:
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """A table for people."""
+    """Human-readable table."""
     most = f'at most {100 * MOST_ADDED:g} %'
     rows = [['replay, per image', 'images', 'estimate', 'added', 'share', most]]
     rows += [

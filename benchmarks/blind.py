@@ -1,21 +1,21 @@
-"""What is said of a person whom nothing explains: no subject, no empty scene, no detector.
+"""Answers for a person in view without subject file, empty scene or detector.
 
-Every clip with a pelvis in its truth is played back and forth to filter and experts as `replay`
-runs them, the person in view from the first image on.
+Every clip with a pelvis in its truth is played back and forth to filter and experts as in `replay`;
+the person is in view from the first image.
 
-blind      they know the images alone
-still      so do they, and the person keeps still for 2 s before anything else
+blind      images only
+still      images only; at first the person stands still for 2 s
 subject    with a subject file
-visit      the scene was seen empty for 2 s
+visit      the empty scene is visible for the first 2 s
 detector   with the keypoints of MediaPipe
 
-    nobody     images that are said to be empty
-    missed     of the images that are answered TRACKING or LOST: those with a joint outside of the
-               space to keep out of
-    off        of the images that are answered TRACKING: those with the pelvis off by more than
-               15 % of its distance
-    tracking   images that are answered TRACKING, of those later than 1 s after the start
-    error      of the joints of the heaviest mode from the pelvis, while TRACKING
+    nobody     number of images with the answer NOBODY
+    missed     number of images with the answer TRACKING or LOST and a joint outside the keep-out
+               space
+    off        number of images with the answer TRACKING in which the distance of the pelvis is
+               wrong by more than 15 %
+    tracking   share of TRACKING in the images later than 1 s after the start
+    error      error of the heaviest mode's joints relative to the pelvis, while TRACKING
 """
 
 from __future__ import annotations
@@ -55,17 +55,17 @@ from msg_tools.messages.images import image_message
 from msg_tools.messages.keep_out import KeepOutState, keep_out_of
 from msg_tools.messages.keypoints import keypoints_message, keypoints_of
 
-RATES = (15.0, 8.0, 2.0, 0.5)  # images a second
-IMAGES, QUICK = 30, 12  # of a run
+RATES = (15.0, 8.0, 2.0, 0.5)  # images per second
+IMAGES, QUICK = 30, 12  # number of images of a run
 BEFORE, LATE, FAR = 2.0, 1.0, 0.15  # see the text above; s, s, share
 BLIND, STILL, SUBJECT, VISIT, DETECTOR = CASES = ('blind', 'still', 'subject', 'visit', 'detector')
-NOISE = 2.0  # of a scene that is shown before, grey levels
+NOISE = 2.0  # noise of a scene shown before the clip, grey levels
 _FRAME = 'camera_optical_frame'
 _SAID = ('keep_out', 'pose_mixture')
 
 
 class Work(NamedTuple):
-    """A clip, what is known of it, images a second, and their number."""
+    """A clip, the case, the rate in images per second, and the number of images."""
 
     folder: Path
     case: str
@@ -74,15 +74,15 @@ class Work(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What is said of an image of the clip.
+    """Answer for an image of the clip.
 
     Attributes:
-        time: since the first image, s.
-        state: of the space to keep out of.
-        missed: whether a true joint lies outside of that space.
-        off: error of the distance of the pelvis, as a share of the true one; NaN: no pose is said.
-        error: mean error of the joints of the heaviest mode from the pelvis, m; NaN: as `off`.
-        existence: probability that somebody is there; NaN: unknown.
+        time: time since the first image, s.
+        state: state of the keep-out space.
+        missed: whether a true joint lies outside the keep-out space.
+        off: relative error of the distance of the pelvis; NaN without a pose.
+        error: mean error of the heaviest mode's joints relative to the pelvis, m; NaN without pose.
+        existence: probability that a person is present; NaN if unknown.
     """
 
     time: float
@@ -94,7 +94,7 @@ class Answer(NamedTuple):
 
 
 def answers_of(work: Work) -> list[Answer]:
-    """What filter and experts say of the images of a clip.
+    """Answers of filter and experts for the images of a clip.
 
     Raises:
         ValueError: the clip can not be read, or lacks what the case needs.
@@ -137,7 +137,7 @@ def answers_of(work: Work) -> list[Answer]:
 
 
 def _keypoints_of(clip: Clip) -> dict[int, Keypoints]:
-    """By stamp, from the bag where no file has them."""
+    """Keypoints by timestamp, from a file or otherwise from the bag."""
     file = clip.folder / 'keypoints_mediapipe.npz'
     if file.is_file():
         content = read_archive(file)
@@ -151,7 +151,7 @@ def _keypoints_of(clip: Clip) -> dict[int, Keypoints]:
 
 
 def _shown_before(clip: Clip, work: Work) -> list[NDArray[np.uint8]]:
-    """Images of the 2 s before the first one of the clip."""
+    """Images for the 2 s before the first one of the clip."""
     scenes = {STILL: clip.images[0], VISIT: clip.background}
     scene = scenes.get(work.case)
     if scene is None:
@@ -190,7 +190,7 @@ def measure(
     """Counts over all clips, by case and rate.
 
     Raises:
-        ValueError: none are there, or one can not be read.
+        ValueError: there are no clips, or one can not be read.
     """
     folders, source = find_clips(clips, moving=True, quick=quick)
     if clips is None and not quick:
@@ -235,7 +235,7 @@ def _counted(answers: list[Answer]) -> dict[str, Any]:
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """A table for people."""
+    """Human-readable table."""
     head = ['case', 'images a second', 'nobody', 'missed', 'off', 'tracking', 'error, mm']
     rows = [
         [

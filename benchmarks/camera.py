@@ -1,13 +1,13 @@
-"""A camera in a process of its own: it shows the images of a clip at a fixed rate.
+"""A camera process that publishes the images of a clip at a fixed rate.
 
     python -m benchmarks.camera FOLDER TRANSPORT RATE IMAGES SUBSCRIBERS [BAG TOPIC]
 
-It publishes `camera_info` and `image`, or `image/compressed`, as drivers do, as sensor data, once
-that many subscribers listen; behind each image the message of its number on a topic of a bag, if
-one is named. The first images are shown back and forth until a line comes on standard input; from
-then on the clip goes on. On standard output it then says by how much the stamps of the
-clip are later than in its bag, ns, and when its first image is due by the monotonic clock, ns. At
-the end it says how late the latest image was published, ns, and stays until another line comes.
+It publishes `camera_info` and `image`, or `image/compressed`, with the sensor-data QoS of drivers,
+once there are SUBSCRIBERS; after each image also the message with its index from TOPIC of BAG, if
+given. The first images are repeated back and forth until a line arrives on standard input; then the
+clip plays. On standard output it prints the shift of the clip's timestamps against its bag, ns, and
+the due time of its first image by the monotonic clock, ns. At the end it prints the maximum delay
+of an image, ns, and waits for another line.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import decode_image, image_message
 
-# Images that are shown before the clip goes on.
+# Number of images that are repeated before the clip starts.
 SWAYING = 4
-# Where the stamp of a header stands that opens a message, behind the encapsulation.
+# Offset of the timestamp in a message that begins with a header, after the encapsulation.
 _STAMP_AT = 4
 
 
 def with_stamp(data: bytes, stamp_ns: int) -> bytes:
-    """A message that opens with a header, with another stamp."""
+    """A serialised message that begins with a header, with another timestamp."""
     stamp = struct.pack('<iI', *divmod(stamp_ns, 10**9))
     return data[:_STAMP_AT] + stamp + data[_STAMP_AT + len(stamp) :]
 
 
 def main(argv: list[str]) -> int:
-    """Shows the clip once."""
+    """Publishes the clip once."""
     folder, transport = Path(argv[0]), argv[1]
     rate, count, subscribers = float(argv[2]), int(argv[3]), int(argv[4])
     import rclpy
@@ -46,7 +46,7 @@ def main(argv: list[str]) -> int:
     from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
     info, images = read_messages(folder, [COMPRESSED], count)
-    # A clip that is shorter is shown back and forth.
+    # A shorter clip is repeated back and forth.
     indices = [index_back_and_forth(number, len(images)) for number in range(count)]
     stamps, frame = [time_ns(image.header.stamp) for image in images], images[0].header.frame_id
     step, calibration = round(1e9 / rate), serialise(info)
@@ -73,7 +73,7 @@ def main(argv: list[str]) -> int:
         time.sleep(0.01)
 
     def publish(number: int, data: bytes, stamp: int, due: int) -> int:
-        """Publishes an image when it is due; how late that was, ns."""
+        """Publishes an image when it is due; returns its delay, ns."""
         while (left := due - time.monotonic_ns()) > 0:
             time.sleep(left * 1e-9)
         late = time.monotonic_ns() - due
@@ -83,7 +83,7 @@ def main(argv: list[str]) -> int:
             detections.publish(with_stamp(more[number], stamp))
         return late
 
-    # A picture that never changes is no evidence of a person, who sways.
+    # Several images are repeated, because a person always sways a little.
     first, shown = [content(number) for number in range(min(SWAYING, len(images)))], 0
     start, shift = time.monotonic_ns(), 0
     while not select.select([sys.stdin], [], [], 0)[0]:
@@ -93,7 +93,7 @@ def main(argv: list[str]) -> int:
     sys.stdin.readline()
     start += shift
     print(shift, start, flush=True)
-    # A picture is made before it is due, as by a driver.
+    # An image is prepared before it is due, as by a driver.
     late = 0
     for number, index in enumerate(indices):
         after = stamps[index] - stamps[0] if number == index else number * step

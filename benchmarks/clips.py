@@ -1,4 +1,4 @@
-"""Clips with known truth: a bag of images, and beside it subject file, empty scene and truth."""
+"""Clips with known truth: a bag of images, with subject file, empty scene and truth."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from msg_tools.messages.camera_info import camera_from_info
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import decode_image
 
-# Joints that the detector and our bodies share.
+# Joints that the detector and the body models share.
 JOINTS_OF_DETECTOR = tuple(
     f'{side}_{name}'
     for name in ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle', 'toe')
@@ -43,17 +43,16 @@ class Clip:
     """Images of one person.
 
     Attributes:
-        folder: where the files are.
-        camera: that saw it.
-        stamps: (T,) ns.
-        images: (T,) BGR.
-        truth: where the joints were.
-        pixels: stamp -> (J, 2) true image positions of the joints of `truth`.
-        background: the empty scene; None: the camera moves.
-        views: stamp -> true rotation (3, 3) and position (3,) of a camera that moves, in the world,
-            m; they stand for odometry. Empty: it stands still, or the clip does not tell.
-        ups: stamp -> (3,) true unit vector against gravity, camera frame; empty: the clip does not
-            tell it.
+        folder: folder of the files.
+        camera: camera of the images.
+        stamps: (T,) timestamps, ns.
+        images: (T,) images, BGR.
+        truth: true positions of the joints.
+        pixels: timestamp -> (J, 2) true image positions of the joints of `truth`.
+        background: image of the empty scene; None if the camera moves.
+        views: timestamp -> true rotation (3, 3) and position (3,) of a moving camera in the world,
+            m, in the role of odometry. Empty if the camera is fixed or its motion unknown.
+        ups: timestamp -> (3,) true unit vector against gravity, camera frame; empty if unknown.
     """
 
     folder: Path
@@ -68,7 +67,7 @@ class Clip:
 
     @property
     def name(self) -> str:
-        """Of the clip."""
+        """Name of the clip."""
         return self.folder.name
 
     @property
@@ -78,11 +77,11 @@ class Clip:
 
 
 def at_rate(clip: Clip, rate: float) -> Clip:
-    """A clip whose images come at a lower rate: some are left out.
+    """A clip at a lower rate, with some images left out.
 
     Args:
-        clip: with all its images.
-        rate: images a second at most; see `rows_at_rate`.
+        clip: clip with all its images.
+        rate: maximum number of images per second; see `rows_at_rate`.
     """
     rows = rows_at_rate(clip.stamps, rate)
     return replace(
@@ -91,14 +90,14 @@ def at_rate(clip: Clip, rate: float) -> Clip:
 
 
 def rows_at_rate(stamps: Sequence[int], rate: float) -> list[int]:
-    """Rows of the images that are kept at a lower rate; the first image is always kept.
+    """Indices of the images kept at a lower rate; the first image is always kept.
 
-    An image is kept when it comes 1 / rate after the last kept one, or at most half the interval
-    between two images earlier.
+    An image is kept if it is 1 / rate after the last kept one, or earlier by at most half the
+    interval between two images.
 
     Args:
-        stamps: (T,) of the images, ns.
-        rate: images a second; 0, or one that is not below that of the images: all are kept.
+        stamps: (T,) timestamps of the images, ns.
+        rate: images per second; 0, or a rate not below that of the images, keeps all.
     """
     if rate <= 0 or len(stamps) < 2:
         return list(range(len(stamps)))
@@ -111,7 +110,7 @@ def rows_at_rate(stamps: Sequence[int], rate: float) -> list[int]:
 
 
 def index_back_and_forth(number: int, count: int) -> int:
-    """Index of what is shown as the number-th, of so many that are shown to the end and back."""
+    """Index of the number-th shown item, if `count` items are shown back and forth."""
     turn = max(2 * count - 2, 1)
     return min(number % turn, turn - number % turn)
 
@@ -119,16 +118,16 @@ def index_back_and_forth(number: int, count: int) -> int:
 def find_clips(
     folder: Path | None, *, moving: bool = False, quick: bool = False
 ) -> tuple[list[Path], str]:
-    """Folders of clips with truth, and where they come from.
+    """Folders of clips with truth, and a description of their source.
 
     Args:
-        folder: that holds the clips; None: the development data, and where that is absent the
-            bags of this repository.
-        moving: whether those are wanted too that have no image of the empty scene.
-        quick: whether, without a folder, one short clip of this repository is enough.
+        folder: folder of the clips; None means the development data or, if missing, the bags of
+            this repository.
+        moving: whether to include clips without an image of the empty scene.
+        quick: whether one short clip of this repository is enough if no folder is given.
 
     Raises:
-        ValueError: no clip is there.
+        ValueError: there is no clip.
     """
     if folder is not None:
         return _clips_in(folder, moving), str(folder)
@@ -142,20 +141,20 @@ def find_clips(
 
 
 def development_folder() -> Path:
-    """Where the development clips are, if they are there."""
+    """Folder of the development clips, which may be missing."""
     return Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared')) / 'video'
 
 
 def with_file(names: Sequence[str], clips: Path | None, file: str) -> list[Path]:
-    """Folders of clips that a benchmark can not do without.
+    """Folders of clips that a benchmark requires.
 
     Args:
-        names: of the clips.
-        clips: folder that holds them; None: the development clips.
-        file: that each must have.
+        names: names of the clips.
+        clips: folder of the clips; None means the development clips.
+        file: name of a file that each must have.
 
     Raises:
-        FileNotFoundError: a clip is not there, or lacks the file.
+        FileNotFoundError: a clip is missing or lacks the file.
     """
     folder = clips or development_folder()
     lacking = [name for name in names if not (folder / name / file).is_file()]
@@ -181,13 +180,13 @@ def _clips_in(folder: Path, moving: bool) -> list[Path]:
 def read_messages(
     folder: Path, kinds: Sequence[str] = IMAGES, frames: int | None = None
 ) -> tuple[Any, list[Any]]:
-    """Calibration and images of a clip as they are in its bag, or the first of them.
+    """Calibration and image messages in the bag of a clip, or its first `frames` images.
 
     Raises:
-        ValueError: a bag that can not be read, or with no such topics.
+        ValueError: the bag can not be read or lacks these topics.
     """
     with BagReader(folder) as bag:
-        # Beside the images there may be depths.
+        # The bag may also contain depth images.
         named = [name for name, topic in bag.topics.items() if topic.msgtype in kinds]
         pictures = [name for name in named if name.strip('/') != DEPTH]
         topic = bag.find_topic(kinds, pictures[0] if len(pictures) == 1 else None).name
@@ -199,7 +198,7 @@ def read_clip(folder: Path, frames: int | None = None) -> Clip:
     """Reads a clip, or its first frames, from a bag, or from a video with its camera.
 
     Raises:
-        ValueError: files that can not be read, or that do not fit each other.
+        ValueError: files can not be read or are inconsistent.
     """
     of_video = not (folder / 'metadata.yaml').is_file()
     camera, stamps, images, truth = (_video if of_video else _bag)(folder, frames)
@@ -234,10 +233,10 @@ Content = tuple[Camera, list[int], list[NDArray[np.uint8]], Truth]
 
 
 class PartialTruth(Truth):
-    """Truth that lacks some joints of some images: they are NaN."""
+    """Truth in which joints may be missing in some images, as NaN."""
 
     def __post_init__(self) -> None:
-        """Nothing is checked."""
+        """Skips all checks."""
 
 
 def _bag(folder: Path, frames: int | None) -> Content:
@@ -249,7 +248,7 @@ def _bag(folder: Path, frames: int | None) -> Content:
 
 
 def _video(folder: Path, frames: int | None) -> Content:
-    """`NAME.mp4` and `camera.yaml`, each image at the stamp of the truth's row."""
+    """Reads `NAME.mp4` and `camera.yaml`; images get the timestamps of the truth's rows."""
     with np.load(folder / 'truth.npz') as content:
         stamps, fps = content['stamps'].tolist()[:frames], float(content['fps'])
         names, joints = content['joint_names'], content['joints'].astype(np.float64)
@@ -269,13 +268,13 @@ def _size(image: NDArray[np.uint8]) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """What a detector says of a clip, from `keypoints_mediapipe.npz`.
+    """Detections of a clip, from `keypoints_mediapipe.npz`.
 
     Attributes:
-        keypoints: by stamp, of the joints that our bodies have.
-        names: (J,) joints of its own 3D poses.
-        joints: by stamp, (J, 3) m, its own 3D pose relative to the middle of the hips; the axes are
-            those of the camera.
+        keypoints: keypoints by timestamp, of the joints in the body models.
+        names: (J,) joints of the detector's own 3D poses.
+        joints: the detector's own 3D pose (J, 3) by timestamp, relative to the middle of the hips,
+            in camera axes, m.
     """
 
     keypoints: dict[int, Keypoints]
@@ -283,7 +282,7 @@ class Detections:
     joints: dict[int, NDArray[np.float64]]
 
 
-# Landmarks of the detector in its order, for files without their names.
+# Landmarks in the detector's order, for files without names.
 _FACE = (
     'nose', 'left_eye_inner', 'left_eye', 'left_eye_outer', 'right_eye_inner', 'right_eye',
     'right_eye_outer', 'left_ear', 'right_ear', 'mouth_left', 'mouth_right',
@@ -293,7 +292,7 @@ _OF_SIDES = (
     'foot_index',
 )  # fmt: skip
 LANDMARK_NAMES = (*_FACE, *(f'{side}_{x}' for x in _OF_SIDES for side in ('left', 'right')))
-# Landmarks of the detector that have other names than our joints.
+# Landmarks of the detector with other names in the body models.
 LANDMARKS = {'left_foot_index': 'left_toe', 'right_foot_index': 'right_toe'}
 SCHEME = 'mediapipe33'
 
@@ -302,7 +301,7 @@ def read_detections(folder: Path, *, lifted: bool = True) -> Detections:
     """Reads the detector's keypoints of a clip.
 
     Raises:
-        ValueError: none are there, or they can not be read.
+        ValueError: the keypoints are missing or can not be read.
     """
     try:
         content = read_archive(folder / 'keypoints_mediapipe.npz')
@@ -326,7 +325,7 @@ def read_detections(folder: Path, *, lifted: bool = True) -> Detections:
 
 
 def table(rows: list[list[str]], *, left: int = 1, markdown: bool = False) -> str:
-    """A table whose first row is its head; so many columns are aligned to the left."""
+    """A table as text; the first row is its head, and the first `left` columns are left-aligned."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
 
     def line(cells: list[str], separator: str) -> str:
@@ -343,7 +342,7 @@ def table(rows: list[list[str]], *, left: int = 1, markdown: bool = False) -> st
 
 
 def rounded(value: Any) -> Any:
-    """Numbers of a report with four digits that mean something."""
+    """The numbers of a report, rounded to four significant digits."""
     if isinstance(value, dict):
         return {key: rounded(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):

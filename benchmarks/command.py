@@ -1,4 +1,4 @@
-"""What the benchmarks have in common as commands: options, stages, and what is printed."""
+"""Common parts of the benchmark commands: options, stages and output."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ Item = TypeVar('Item')
 
 
 def benchmark_parser(name: str, text: str | None, *, quick: str) -> argparse.ArgumentParser:
-    """A parser with the options that every benchmark takes.
+    """A parser with the options of every benchmark.
 
     Args:
-        name: of the benchmark.
-        text: what it measures.
-        quick: what --quick does.
+        name: name of the benchmark.
+        text: description of the benchmark.
+        quick: description of --quick.
     """
     parser = argparse.ArgumentParser(
         prog=f'python -m benchmarks {name}',
@@ -38,7 +38,7 @@ def benchmark_parser(name: str, text: str | None, *, quick: str) -> argparse.Arg
 def add_choice(
     parser: argparse.ArgumentParser, stages: Sequence[str], metavar: str = 'STAGE'
 ) -> None:
-    """Adds --only, some of the stages."""
+    """Adds the option --only, which selects stages."""
     parser.add_argument(
         '--only', nargs='+', choices=stages, default=stages, metavar=metavar,
         help=f'some of {", ".join(stages)}',
@@ -46,7 +46,7 @@ def add_choice(
 
 
 def show(result: dict[str, Any], text: Callable[[dict[str, Any]], str], *, as_json: bool) -> int:
-    """Prints what was measured; the exit code."""
+    """Prints a result; returns the exit code."""
     print(json.dumps(rounded(result), indent=1) if as_json else text(result))
     return 0
 
@@ -58,17 +58,17 @@ def run_benchmark(
     *,
     as_json: bool,
 ) -> int:
-    """Measures and prints; the exit code.
+    """Runs a benchmark and prints its result; returns the exit code.
 
     Args:
-        name: of the benchmark.
-        measure: what is measured.
-        text: tells people of it.
-        as_json: whether a program is told.
+        name: name of the benchmark.
+        measure: function that measures.
+        text: function that makes a human-readable text of the result.
+        as_json: whether to print JSON instead.
 
     Returns:
-        0, also where the data that the benchmark needs is not there, which a line on stderr says;
-        1: a line on stderr says what is wrong.
+        0, also if required data are missing, which a line on stderr reports; 1 after other errors,
+        which a line on stderr explains.
     """
     try:
         result = measure()
@@ -84,7 +84,7 @@ def run_benchmark(
 def run_stages(
     benchmark: str, stages: Mapping[str, Callable[[], Any]], only: Sequence[str]
 ) -> dict[str, Any]:
-    """What stages measure, in their order, with the machine that they ran on."""
+    """Results of the stages in their order, with a description of the machine."""
     chosen = [name for name in stages if name in only]
     result: dict[str, Any] = {'machine': description()}
     for name in told(benchmark, chosen):
@@ -95,13 +95,13 @@ def run_stages(
 def told(
     benchmark: str, items: Iterable[Item], name: Callable[[Item], str] = str
 ) -> Iterator[Item]:
-    """The items, with a line on stderr where each begins: minutes may pass until the next."""
+    """Yields the items, with a line on stderr for each, because an item may take minutes."""
     chosen = list(items)
     start = time.monotonic()
     for number, item in enumerate(chosen, 1):
         minutes, seconds = divmod(round(time.monotonic() - start), 60)
         spent = f'{minutes}:{seconds:02d}'
-        # Not through a bar that another part may be showing.
+        # tqdm.write does not disturb a progress bar of another part.
         line = f'{benchmark}: {name(item)}, {number} of {len(chosen)}, at {spent}'
         tqdm.write(line, file=sys.stderr)
         yield item

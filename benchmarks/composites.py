@@ -1,18 +1,18 @@
-"""composites: clips of single people in one image, who cross: are they told apart?
+"""composites: people from several clips cross in one image; do they keep their identities?
 
-Each person is cut from a clip by the true mask and pasted in order of depth, at least
-`LEAST_HEIGHT` px high; while the clip plays each drifts to the place of another. Clips, places and
-directions are drawn from a seed. The detector that installs with the package finds them, and
+Each person is cut from a clip with the true mask and pasted in order of depth, at least
+`LEAST_HEIGHT` px high; while the clip plays, each drifts to the initial position of another. Clips,
+positions and directions are drawn from a seed. The detector of the package finds them, and
 `replay --people` tracks them, without a background.
 
-same        share of the images that show somebody by `LEAST_SEEN` of the mask in which the detector
-            has them under the identity that they had most often in their first second
-tracked     the same share of what is tracked
-exchanged   share of these images in which they have the identity of somebody else
-false       identities that are nobody's in most of their images
+same        share of images with at least `LEAST_SEEN` of a person's mask in which the detector
+            gives the person the identity that was most frequent in the first second
+tracked     the same share for tracks
+exchanged   share of these images in which a person has the identity of another person
+false       number of identities that match nobody in most of their images
 missed      share of the images in stretches of more than a second without a detection
-mm          distance of the joints from the truth, seen from the pelvis along the line of sight, of
-            the heaviest mode; alone: of the same person pasted alone
+mm          distance of the joints of the heaviest mode from the truth, relative to the pelvis, in
+            axes along the line of sight; alone: with only this person pasted
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ from msg_tools.messages.detections import people_message
 from msg_tools.messages.headers import FRAME_ID, SECOND_NS, START_NS
 from msg_tools.messages.images import encode_jpeg, jpeg_message
 
-# Clips of people who are seen whole, by a camera that stands still.
+# Clips in which a fixed camera sees the whole person.
 CLIPS = (
     'charleston', 'dab', 'drill', 'kick', 'laugh', 'shoot', 'signals', 'traffic', 'turns', 'walk',
     'wander', 'window',
@@ -65,13 +65,17 @@ SIZES = {2: (640, 480), 4: (1280, 720)}
 CAMERA_RATE, RATES = 30.0, (30.0, 8.0)
 SEEDS, QUICK_RATE = 10, 4.0
 FOCAL = 600.0
-DURATION, WAIT, END = 5.0, 1.0, 0.5  # s: of all, before somebody moves on, after
+DURATION, WAIT, END = (
+    5.0,
+    1.0,
+    0.5,
+)  # duration of a composite, and times at rest at its start and end, s
 LEAST_HEIGHT, MOST_HEIGHT = 150.0, 260.0  # px
 LEAST_SEEN = 0.3
-# Distance of trunks from the truth, in heights, within which somebody is that person.
+# Maximum distance of a trunk from the true one for a match, in heights of the person.
 MATCH = 0.2
 TRUNK = ('left_shoulder', 'right_shoulder', 'left_hip', 'right_hip')
-QUALITY = 90  # of JPEG
+QUALITY = 90  # JPEG quality
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,11 +83,11 @@ class Shown:
     """A person in a composite.
 
     Attributes:
-        clip: name.
-        joints: (T, J, 3) true positions, m, as if seen where they are pasted.
-        pixels: (T, J, 2) true places in the image.
-        seen: (T,) share of the mask that nobody hides, and that the image holds.
-        heights: (T,) of the mask, px.
+        clip: name of the clip.
+        joints: (T, J, 3) true positions in the frame of the clip's camera, m.
+        pixels: (T, J, 2) true positions in the image, px.
+        seen: (T,) visible share of the mask.
+        heights: (T,) height of the mask, px.
     """
 
     clip: str
@@ -99,8 +103,8 @@ class Composite:
     """Images of several people.
 
     Attributes:
-        stamps: (T,) ns.
-        images: (T,) BGR.
+        stamps: (T,) timestamps, ns.
+        images: (T,) images, BGR.
     """
 
     camera: Camera
@@ -115,14 +119,14 @@ def composite(
     """A composite of `count` people.
 
     Args:
-        shown: numbers of those who are pasted; None: all.
+        shown: indices of the people to paste; None means all.
     """
     rng = np.random.default_rng([seed, count])
     names = rng.permutation(CLIPS)[:count].tolist()
     width, height = SIZES[count]
     camera = Camera(FOCAL, FOCAL, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
     clips = [read_clip(folder / name) for name in names]
-    # Places from left to right at the start, and at the end those of another.
+    # Lanes from left to right; each person starts in one and ends in another.
     lanes = (np.arange(count) + 0.5) / count * width
     start, end = rng.permutation(count), rng.permutation(count)
     while (start == end).any():
@@ -206,7 +210,7 @@ class _Cut:
         return float(self.masks[row].sum() * self.scale**2)
 
     def pixels(self, t: int, at: float) -> Array:
-        """True places (J, 2) of the joints."""
+        """True positions (J, 2) of the joints, px."""
         stamp = self.clip.stamps[self._row(t)]
         return self.scale * self.clip.pixels[stamp] + self._shift(t, at)
 
@@ -215,7 +219,7 @@ class _Cut:
         return self.clip.truth.joints[self.clip.stamps[self._row(t)]]
 
     def height(self, t: int) -> float:
-        """Of the person, px."""
+        """Height of the person, px."""
         rows = np.nonzero(self.masks[self._row(t)].any(1))[0]
         return self.scale * float(np.ptp(rows) + 1) if len(rows) else 1.0
 
@@ -224,10 +228,10 @@ class _Cut:
 
 
 def owners_of(made: Composite, places: Sequence[dict[str, Array]]) -> NDArray[Any]:
-    """Name (P, T) under which each person is known in each image; '': under none.
+    """Identity (P, T) of each person in each image; empty if none matches.
 
     Args:
-        places: of each image the trunk (4, 2), px, by name.
+        places: for each image, the trunks (4, 2) by identity, px.
     """
     result = np.full((len(made.people), len(made.stamps)), '', dtype=object)
     for t, known in enumerate(places):
@@ -246,7 +250,7 @@ def owners_of(made: Composite, places: Sequence[dict[str, Array]]) -> NDArray[An
 
 
 def shares(made: Composite, owners: NDArray[Any]) -> tuple[float, float, list[str]]:
-    """Shares of images with the own identity and that of somebody else; the own identities."""
+    """Shares of images with a person's own identity and another's, and the own identities."""
     seconds = (np.array(made.stamps) - made.stamps[0]) / SECOND_NS
     seen = np.array([x.seen > LEAST_SEEN for x in made.people])
     own = []
@@ -276,7 +280,7 @@ def missed(made: Composite, owners: NDArray[Any]) -> float:
 
 
 def of_composite(work: tuple[int, int, float, bool]) -> dict[str, Any]:
-    """Scores of a composite: seed, number of people, rate, whether each is tracked alone, too."""
+    """Scores of a composite; given are seed, number of people, rate, and whether to track each."""
     seed, count, rate, alone = work
     made = composite(development_folder(), seed, count, rate)
     with tempfile.TemporaryDirectory() as folder:
@@ -324,7 +328,7 @@ def _error_alone(seed: int, count: int, rate: float, number: int) -> float:
 def tracked(
     made: Composite, folder: Path
 ) -> tuple[list[dict[str, Array]], dict[str, tuple[tuple[str, ...], dict[int, Array]]]]:
-    """Trunks in each image by the detector's name, and what is tracked, see `tracks_in`."""
+    """Trunks in each image by detected identity, and tracks, see `tracks_in`."""
     detector, messages = PeopleDetector(max(len(made.people), 2)), RosbagsMessages()
     found = []
     with BagWriter(folder / 'made') as bag:
@@ -346,7 +350,7 @@ def tracked(
 def error(
     person: Shown, made: Composite, track: tuple[tuple[str, ...], dict[int, Array]] | None
 ) -> float:
-    """Mean distance of the joints of a track from the truth, mm; NaN: nothing is tracked."""
+    """Mean distance of the joints of a track from the truth, mm; NaN without a track."""
     if track is None:
         return float('nan')
     names, joints = track
@@ -356,7 +360,7 @@ def error(
     for t, stamp in enumerate(made.stamps):
         if stamp in joints and person.seen[t] > LEAST_SEEN:
             found, right = joints[stamp][0][own], person.joints[t][true]
-            # Along the line of sight: somebody pasted elsewhere is seen as before.
+            # In axes along the line of sight, because pasting elsewhere does not change the view.
             one, other = ((x - x[:1]) @ ray_rotations(x[:1])[0] for x in (found, right))
             away.append(np.linalg.norm(one[1:] - other[1:], axis=1).mean())
     return 1e3 * float(np.mean(away)) if away else float('nan')
@@ -368,7 +372,7 @@ def measure(
     """Scores by number of people and rate.
 
     Raises:
-        FileNotFoundError: the clips are not there.
+        FileNotFoundError: the clips are missing.
     """
     if not development_folder().is_dir():
         raise FileNotFoundError(f'{development_folder()}: no such folder (set HMT_SHARED)')
@@ -384,7 +388,7 @@ def measure(
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """A table for people."""
+    """Human-readable table."""
     head = [
         'people', 'images a second', 'composites', 'same', 'tracked', 'exchanged', 'false',
         'missed', 'mm', 'mm, alone',

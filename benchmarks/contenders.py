@@ -1,19 +1,19 @@
 """contenders: models of p(pose | image) with the same pairs and the same processor time (BME 3).
 
-Every model gets the same inputs, targets and pairs, and so much processor time: it learns from
-twice as many pairs, or a network in twice as many steps, until the next time would be too long; the
-last one counts. All are calibrated on motions left out, within that time.
+Every model gets the same inputs, targets, pairs and processor time. Training is repeated with twice
+as many pairs, or for a network with twice as many steps, as long as the time suffices; the last one
+is scored. All are calibrated on held-out motions, within that time.
 
-keypoints      windows of keypoints of a detector that errs, `experts.lifter`
-features       the units of the last layer of the lifter that ships, on such windows
+keypoints      windows of keypoints with detector errors, the input of `experts.lifter`
+features       the units of the last layer of the bundled lifter, on such windows
 silhouettes    descriptors of silhouettes as uneven as those of background subtraction
-targets        joints along the axes of a camera that looks at the person
+targets        joints in the axes of a camera turned towards the person
 
-All are reduced to principal components. Nobody of the tested motions is learned from. Distances
-are those of the joints from the truth, seen from the pelvis: of the heaviest component, and of the
-best of the five heaviest. The log density is that of the components of targets, nats a number;
-regions are those of single coordinates of joints. What ships learned from more, for hours, and
-from those who sit. Numbers of experts were chosen with these people in view.
+All are reduced to principal components. No person of the tested motions is in the training data.
+Distances are those of the joints from the truth, relative to the pelvis, for the heaviest component
+and for the best of the five heaviest. The log density is that of the reduced targets, nats per
+number; regions are those of single joint coordinates. The bundled models were trained for hours,
+with more data, which includes the seated people. Numbers of experts were chosen on these people.
 """
 
 from __future__ import annotations
@@ -61,15 +61,15 @@ BUDGET = 60.0  # s of processor time for each model
 KEYPOINTS, FEATURES, SILHOUETTES = 'keypoints', 'features', 'silhouettes'
 CUES = (KEYPOINTS, FEATURES, SILHOUETTES)
 PAIRS = {KEYPOINTS: 24_000, FEATURES: 24_000, SILHOUETTES: 12_000}
-TESTED = 250  # pairs of an activity
+TESTED = 250  # number of test pairs per activity
 INPUTS, TARGETS = 40, 24  # principal components
-FIRST, FIRST_STEPS = 400, 250  # pairs, and steps, of the first time
-QUICK = 60  # pairs, with --quick
-GROWTH = 2.6  # of the time for twice as many pairs, at most
+FIRST, FIRST_STEPS = 400, 250  # number of pairs, and of steps, in the first training
+QUICK = 60  # number of pairs with --quick
+GROWTH = 2.6  # maximum growth of the time with twice as many pairs
 BEST_OF = 5
 SHARES = (0.5, 0.9)
 
-# Tested motions by activity, and those of people who sit: two of UI-PRMD are left out.
+# Tested motions by activity, and the people of UI-PRMD left out of the training for sitting.
 ACTIVITIES = {
     'walking': ('cmu_06_01_walk', 'cmu_15_wander'),
     'running': ('cmu_run_c',),
@@ -90,7 +90,7 @@ Maker = Callable[[int], ConditionalDensity]
 
 
 def _of_kind(name: str, experts: int = BEST_OF, **changes: Any) -> Maker:
-    """A model of `KINDS` without its calibration, maybe with other parameters."""
+    """Maker of a model of `KINDS` without calibration, with optional parameters."""
 
     def make(count: int) -> ConditionalDensity:
         kind = KINDS[name]
@@ -117,14 +117,14 @@ NETWORK, SHIPPED = 'network', 'what ships'
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Pairs to learn from, and to test with.
+    """Training pairs and test pairs.
 
     Attributes:
-        inputs, targets: (N, `INPUTS`), (N, `TARGETS`).
-        groups: (N,) the motion of each.
-        tested: inputs, targets and true joints (n, J, 3) by activity.
-        middle, basis: (3 J,), (`TARGETS`, 3 J) of the joints that targets are.
-        residual: (3 J,) variances that targets leave out.
+        inputs, targets: (N, `INPUTS`), (N, `TARGETS`) training pairs.
+        groups: (N,) index of the motion of each pair.
+        tested: test inputs, targets and true joints (n, J, 3) by activity.
+        middle, basis: mean (3 J,) and principal components (`TARGETS`, 3 J) of joints.
+        residual: (3 J,) variances of joints outside the principal components.
     """
 
     inputs: Array
@@ -137,7 +137,7 @@ class Pairs:
 
 
 def _motions(quick: bool) -> tuple[list[PoseSequence], dict[str, list[PoseSequence]]]:
-    """Motions to learn from, and tested ones by activity."""
+    """Training motions, and test motions by activity."""
     body = load_body('human37')
     if quick:
         learned = [procedural_sequence(x, body, 4.0, 1) for x in PROCEDURAL.values()]
@@ -158,7 +158,7 @@ def _motions(quick: bool) -> tuple[list[PoseSequence], dict[str, list[PoseSequen
 
 
 def pairs_of(cue: str, *, quick: bool = False) -> tuple[Pairs, dict[str, Any]]:
-    """Pairs of a cue, and what the model that ships says of the tested ones, by activity."""
+    """Pairs of a cue, and scores of the bundled model on the test pairs by activity."""
     learned, tested = _motions(quick)
     count, few = (QUICK, 12) if quick else (PAIRS[cue], TESTED)
     if cue != SILHOUETTES:
@@ -191,7 +191,7 @@ def pairs_of(cue: str, *, quick: bool = False) -> tuple[Pairs, dict[str, Any]]:
     scored = {
         k: _scores(found, tests[k], pairs)
         for k, found in shipped.items()
-        # What ships has learned from those who sit.
+        # The bundled model was trained on the seated people.
         if k != 'sitting'
     }
     return pairs, scored
@@ -200,7 +200,7 @@ def pairs_of(cue: str, *, quick: bool = False) -> tuple[Pairs, dict[str, Any]]:
 def _windows(
     motions: Sequence[PoseSequence], count: int, seed: int
 ) -> tuple[Array, Array, NDArray[np.intp]]:
-    """Inputs of windows, joints (N, J, 3) and motions; the same number of each motion."""
+    """Inputs of windows, joints (N, J, 3) and motion indices, with equal numbers per motion."""
     settings = replace(
         WindowSettings(), causal=1.0, cut=0.0, near=0.0, recombined=0.0, asynchronous=0.0,
         seated=0.0, lengths=1.0,
@@ -216,13 +216,13 @@ def _windows(
 
 
 def _lifted(inputs: Array) -> tuple[Array, Array, Array]:
-    """Log weights (n, K), means (n, K, J, 3) and variances (n, K, 3 J) of the lifter that ships."""
+    """Log weights (n, K), means (n, K, J, 3) and variances (n, K, 3 J) of the bundled lifter."""
     gates, means, deviations = load_lifter().network(inputs.astype(np.float32))
     return gates, means, np.square(deviations).reshape(*gates.shape, -1)
 
 
 def _features(inputs: Array) -> Array:
-    """Units (n, H) of the last layer of the lifter that ships."""
+    """Units (n, H) of the last layer of the bundled lifter."""
     network = load_lifter().network
     return network.features(network.whitened(inputs.astype(np.float32))).astype(np.float64)
 
@@ -251,7 +251,7 @@ def _silhouettes(
 
 
 def _joints(poses: Array, before: Array | None = None) -> Array:
-    """Joints (N, J, 3) from the hips along the axes of a camera that looks at poses, or one."""
+    """Joints (N, J, 3) relative to the hips, in axes turned towards each pose or `before`."""
     body = load_body('human37')
 
     def places(x: Array) -> tuple[Array, Array]:
@@ -271,9 +271,9 @@ def _joints(poses: Array, before: Array | None = None) -> Array:
 def learned_in_time(
     name: str, pairs: Pairs, budget: float
 ) -> tuple[ConditionalDensity, int, float] | None:
-    """A model that has learned, from so many pairs and in so many s; None: the time was too short.
+    """Trained model, number of pairs and processor time, s; None if the time was too short.
 
-    A network tells its steps in the place of pairs.
+    For a network the number of steps replaces that of pairs.
     """
     order = np.random.default_rng(0).permutation(len(pairs.inputs))
     size = FIRST_STEPS if name == NETWORK else min(FIRST, len(order))
@@ -295,7 +295,7 @@ def learned_in_time(
 
 
 def _scores(found: Any, test: tuple[Array, Array, Array], pairs: Pairs) -> dict[str, float]:
-    """Scores of log weights (n, K), means (n, K, J, 3) and variances (n, K, 3 J); None: unknown."""
+    """Scores of log weights (n, K), means (n, K, J, 3) and variances (n, K, 3 J) or None."""
     logs, means, variances = found
     true = test[2]
     order = np.argsort(-logs, axis=1, kind='stable')[:, :BEST_OF]
@@ -319,7 +319,7 @@ def _scores(found: Any, test: tuple[Array, Array, Array], pairs: Pairs) -> dict[
 def _projected_density(
     logs: Array, means: Array, variances: Array, targets: Array, pairs: Pairs
 ) -> float:
-    """Mean log density of targets (n, D), nats a number, of a mixture over joints."""
+    """Mean log density of targets (n, D) under a mixture over joints, nats per number."""
     basis = pairs.basis
     centres = (means.reshape(*logs.shape, -1) - pairs.middle) @ basis.T
     spread = np.einsum('di,nki,ei->nkde', basis, variances, basis, optimize=True)
@@ -351,7 +351,7 @@ def _read(path: Path) -> Pairs:
 
 
 def of_model(work: tuple[Path, str, float]) -> dict[str, Any]:
-    """What a model learned within the time, and its scores by activity."""
+    """Trains a model within the time, and returns its scores by activity."""
     path, name, budget = work
     pairs = _read(path)
     found = learned_in_time(name, pairs, budget)
@@ -381,7 +381,7 @@ def measure(
 
     Raises:
         ValueError: the budget is not above 0.
-        FileNotFoundError: the motion capture is not there.
+        FileNotFoundError: the motion capture data are missing.
     """
     if not budget > 0.0:
         raise ValueError(f'--budget {budget:g}: wanted some seconds of processor time, above 0')
@@ -409,7 +409,7 @@ def measure(
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """Tables for people, by cue: means over activities, then each activity."""
+    """Human-readable tables by cue: means over activities, then each activity."""
     parts = [f'{result["budget"]:g} s of processor time each; mm unless said']
     for cue in dict.fromkeys(x['cue'] for x in result['rows']):
         own = [x for x in result['rows'] if x['cue'] == cue]

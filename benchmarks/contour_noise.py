@@ -1,10 +1,10 @@
-"""contour_noise: how far contours of people lie from the model's, in metres.
+"""contour_noise: distances of people's contours from the model's, in metres.
 
-The poses of the body, with the true lengths, that come nearest to the true joints of rendered clips
-of another body; its flesh fitted once to the true silhouettes of all clips, a Gaussian prior on its
-growth; then the signed distances, positive inside out, of contour points that no other part covers
-to the outline of the subtracted silhouettes. Robust deviations by part, at the sides and in front
-and behind, and correlations along the contour: the content of `hmt_ros/image/contour_noise.yaml`.
+The body, with the true lengths, is fitted to the true joints of rendered clips of another body; its
+flesh is fitted once to the true silhouettes of all clips, with a Gaussian prior on its growth. Then
+the signed distances, positive outwards, of uncovered contour points to the outline of the
+subtracted silhouettes give robust deviations by part, at the sides and in front or behind, and
+correlations along the contour: the content of `hmt_ros/image/contour_noise.yaml`.
 """
 
 from __future__ import annotations
@@ -40,19 +40,19 @@ Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 CLIPS = ('walk', 'charleston', 'wander', 'shoot', 'signals', 'scoop', 'kick', 'exercise')
-EVERY = 12  # images
+EVERY = 12  # interval of the used images
 QUICK_EVERY, QUICK_STEPS = 60, 1
-# Of the true silhouettes, to which the flesh is fitted.
+# Settings of the coverage term for fitting the flesh to the true silhouettes.
 TERM = TermSettings(30.0, 3.0, 8.0)
 SETTINGS = LikelihoodSettings.of_terms(coverage=TERM)
 MOST_STEPS = 25
-# Of a step, and of a central difference, in deviations over people.
+# Maximum step, and step of a central difference, in standard deviations over people.
 LARGEST_STEP, DIFFERENCE = 0.8, 0.3
-CONVERGED = 0.002  # share of the energy
+CONVERGED = 0.002  # relative decrease of the energy
 AHEAD = 0.7  # |sine| of the angle around a ring from which a point is in front or behind
 MARGIN = 2  # px from the border of an image
 RINGS_APART = (1, 2, 3)
-FURTHEST = 0.05  # m, of a distance in a correlation
+FURTHEST = 0.05  # bound to which distances are clipped for correlations, m
 HEADER = (
     'How far the contour of a person lies from that of the model at the true pose, as standard '
     'deviations in m: at the sides of a part, along the x axis of its segment, and in front and '
@@ -70,10 +70,10 @@ class Distances(NamedTuple):
     """Distances of contour points to outlines: M points.
 
     Attributes:
-        values: (M,) m, positive where the model is larger.
+        values: (M,) signed distances, m, positive if the model is larger.
         parts: (M,) index of the part.
-        ahead: (M,) whether the point is in front of its part or behind, not at a side.
-        rings: (M,) ring of the point; the second points of rings are numbered apart.
+        ahead: (M,) whether the point is in front of or behind its part, not at a side.
+        rings: (M,) ring of the point; the second points of rings have their own numbers.
         images: (M,) number of the image.
     """
 
@@ -86,14 +86,14 @@ class Distances(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """A clip at the poses that come nearest to the truth: T images.
+    """A clip of T images, with the poses nearest to the truth.
 
     Attributes:
-        body: with the true lengths.
-        camera: that saw it.
-        poses: (T, d).
-        observations: of the true silhouettes.
-        masks: subtracted silhouettes.
+        body: body with the true lengths.
+        camera: camera of the clip.
+        poses: (T, d) poses nearest to the truth.
+        observations: observations of the true silhouettes.
+        masks: silhouettes from background subtraction.
     """
 
     body: Body
@@ -107,7 +107,7 @@ def posed(folder: Path, every: int = EVERY) -> Posed:
     """Reads a clip.
 
     Raises:
-        ValueError: it can not be read, or lacks the true silhouettes or the empty scene.
+        ValueError: the clip can not be read, or lacks true silhouettes or the empty scene.
     """
     clip, body, starts = fitted(folder)
     silhouettes = silhouettes_of(clip, every)
@@ -120,11 +120,11 @@ def posed(folder: Path, every: int = EVERY) -> Posed:
 
 
 def fitted_growth(clips: Sequence[Posed], most_steps: int = MOST_STEPS) -> Array:
-    """How the groups of parts grow (G, 5) to fit the true silhouettes; poses are held.
+    """Growth (G, 5) of the groups of parts that fits the true silhouettes at fixed poses.
 
-    Levenberg-Marquardt, with a Gaussian prior of the deviations `GROWTH_SIGMAS`. The gradient is
-    that of differences: derivatives do not see which points of the contour come to light or are
-    covered.
+    Levenberg-Marquardt, with a Gaussian prior of standard deviations `GROWTH_SIGMAS`. The gradient
+    is computed by differences, because derivatives do not include changes of visibility along the
+    contour.
     """
     groups = len(ShapeSpace(clips[0].body).groups)
     spread = np.tile(np.array([*GROWTH_SIGMAS.values()]), groups)
@@ -147,7 +147,7 @@ def fitted_growth(clips: Sequence[Posed], most_steps: int = MOST_STEPS) -> Array
 
 
 def energy_of(clips: Sequence[Posed], growth: Array) -> float:
-    """Energy of growth (G * 5,): of the true silhouettes of all clips, and of the prior."""
+    """Energy of growth (G * 5,) from the true silhouettes of all clips and the prior."""
     spread = np.tile(np.array([*GROWTH_SIGMAS.values()]), len(growth) // len(GROWTH_SIGMAS))
     result = 0.5 * float(((growth / spread) ** 2).sum())
     for clip in clips:
@@ -177,16 +177,16 @@ def derivatives_of(clips: Sequence[Posed], growth: Array) -> tuple[Array, Array]
 
 
 def grown(body: Body, growth: Array) -> Body:
-    """A body whose groups of parts have grown, (G, 5) or flat."""
+    """The body with growth (G, 5), or flat, applied to its groups of parts."""
     space = ShapeSpace(body)
     return space.moved(np.concatenate([np.zeros(space.lengths), np.ravel(growth)]))
 
 
 def contour_distances(body: Body, camera: Camera, poses: Array, masks: Sequence[Mask]) -> Distances:
-    """Of the contour points that no part covers to the outlines of silhouettes, pose by pose."""
+    """Distances of uncovered contour points from the outlines of silhouettes, for all poses."""
     columns, origins = forward(body.skeleton, poses).by_pose()
     count, every = len(body.flesh.ring_parts), np.ones(len(body.shapes), dtype=np.bool_)
-    # Deviations of 0 at the sides and 1 ahead make the noise of a point its share of ahead.
+    # With deviations of 0 at the sides and 1 ahead, the noise of a point is its share of ahead.
     flesh = flesh_table_of(body)._replace(ring_noise=np.tile([0.0, 1.0], (count, 1)))
     height, width = masks[0].shape
     found = []
@@ -218,7 +218,7 @@ def contour_distances(body: Body, camera: Camera, poses: Array, masks: Sequence[
 
 
 def joined(found: Sequence[Distances]) -> Distances:
-    """Distances of several clips, whose images are numbered on."""
+    """Distances of several clips, with consecutive image numbers."""
     images, before = [], 0
     for own in found:
         images.append(own.images + before)
@@ -233,7 +233,7 @@ def robust_deviation(values: Array) -> float:
 
 
 def correlation(found: Distances, apart: int) -> float:
-    """Correlation of distances on the same part of an image so many rings apart."""
+    """Correlation of distances on the same part of an image, `apart` rings apart."""
     places = {place: i for i, place in enumerate(zip(found.images, found.rings, strict=True))}
     pairs = [
         (i, other)
@@ -246,7 +246,7 @@ def correlation(found: Distances, apart: int) -> float:
 
 
 def independent_points(points: float, correlations: Sequence[float]) -> float:
-    """How many independent points so many are worth whose neighbours correlate."""
+    """Effective number of independent points, if neighbouring ones are correlated."""
     return points / (1.0 + 2.0 * sum(correlations))
 
 
@@ -257,15 +257,15 @@ def groups_of(body: Body) -> list[str]:
 
 
 def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]:
-    """Deviations by group of parts, correlations, and the growth that was fitted.
+    """Deviations by group of parts, correlations, and fitted growth.
 
     Args:
-        clips: folder of the clips; None: the development clips.
+        clips: folder of the clips; None means the development clips.
         quick: a few images of one clip, and one step of the fit.
 
     Raises:
-        FileNotFoundError: a clip is not there.
-        ValueError: a clip that can not be used.
+        FileNotFoundError: a clip is missing.
+        ValueError: a clip can not be used.
     """
     wanted = CLIPS[:QUICK] if quick else CLIPS
     folders = with_file(wanted, clips, 'truth.npz')
@@ -305,7 +305,7 @@ def summary(found: Distances, body: Body, growth: Array) -> dict[str, Any]:
 
 
 def as_yaml(result: dict[str, Any]) -> str:
-    """The file that the likelihood reads; parts without a name have the median over the groups."""
+    """Text of the file for the likelihood; `other` parts get the median over the groups."""
     rows = {
         name: [row[side]['deviation'] for side in ('side', 'ahead')]
         for name, row in result['groups'].items()
@@ -321,7 +321,7 @@ def as_yaml(result: dict[str, Any]) -> str:
         textwrap.fill(text.format(**numbers), 100, initial_indent='# ', subsequent_indent='# ')
         for text in HEADER
     )
-    # A side that was never seen has the other's deviation.
+    # A side that was never visible gets the other side's deviation.
     lines = [
         f'{name}: [{side or ahead:.3f}, {ahead or side:.3f}]'
         for name, (side, ahead) in rows.items()
@@ -330,7 +330,7 @@ def as_yaml(result: dict[str, Any]) -> str:
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """The file, as it is to be put in the place of `hmt_ros/image/contour_noise.yaml`."""
+    """New text of the file `hmt_ros/image/contour_noise.yaml`."""
     text = as_yaml(result)
     return f'```yaml\n{text}```' if markdown else text
 
@@ -339,12 +339,12 @@ def signed_distance(mask: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Distance (H, W) to the outline of a mask (H, W), 0 or 1, px, positive outside."""
     outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5)
     inside = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
-    # The outline lies between the pixels: half a pixel from either side.
+    # The outline lies between pixels, half a pixel from either side.
     return np.where(mask > 0, 0.5 - inside, outside - 0.5)
 
 
 def main(argv: list[str]) -> int:
-    """Runs the benchmark; without the clips it tells so and does nothing."""
+    """Runs the benchmark; reports missing clips."""
     parser = benchmark_parser(
         'contour_noise', __doc__, quick='a few images of one clip, and one step of the fit'
     )

@@ -1,10 +1,9 @@
-"""detectors: what each detector that is installed sees, and what poses come of it.
+"""detectors: image errors of each installed detector, and errors of the resulting poses.
 
-The detectors of `hmt_ros.detectors` look at the images of clips one after another; real clips stand
-first. Errors in the image are those of shoulders, elbows, wrists, hips, knees and ankles that the
-truth has; `varying` is without the mean error of each joint, which is partly where annotators say
-that a joint is. Errors of poses, by images and keypoints with gravity given where it is known, are
-those of `tracking --parts oracles`.
+The detectors of `hmt_ros.detectors` process the images of clips; real clips come first. Errors in
+the image are those of shoulders, elbows, wrists, hips, knees and ankles in the truth; `varying` is
+without the mean error of each joint, which is partly due to the definition of a joint. Errors of
+poses, from images and keypoints with gravity if known, are those of `tracking --parts oracles`.
 """
 
 from __future__ import annotations
@@ -39,15 +38,15 @@ from hmt_ros.image.terms.keypoints import Keypoints
 Array = NDArray[np.float64]
 
 CLIPS = tuple(name for group in GROUPS.values() for name in group)
-# Joints of limbs, which are landmarks of all detectors.
+# Joints of limbs, which all detectors have as landmarks.
 JOINTS = tuple(name for name in EVALUATED_JOINTS if other_side(name) != name)
 
 
 def seen_by(detector: str, given: Given) -> tuple[dict[int, Keypoints], float]:
-    """What a detector finds in the images of a clip, by stamp, and ms of processor time an image.
+    """Keypoints of a detector in a clip, by timestamp, and processor time per image, ms.
 
     Raises:
-        DetectorError: it is not installed.
+        DetectorError: the detector is not installed.
     """
     made, found, start = DETECTORS[detector].make(), {}, time.process_time()
     for stamp, image in zip(given.clip.stamps, given.clip.images, strict=True):
@@ -59,7 +58,7 @@ def seen_by(detector: str, given: Given) -> tuple[dict[int, Keypoints], float]:
 
 
 def image_errors(clip: Clip, found: dict[int, Keypoints]) -> tuple[float, float]:
-    """Mean distance from the true joints in the image, px: all of it, and what varies."""
+    """Mean distance from the true joints in the image, px, with and without mean errors."""
     truth = clip.truth
     names = [name for name in JOINTS if name in truth.joint_names]
     rows = [truth.joint_names.index(name) for name in names]
@@ -74,7 +73,7 @@ def image_errors(clip: Clip, found: dict[int, Keypoints]) -> tuple[float, float]
 
 
 def of_clip(folder: Path, detector: str, seed: int, limit: int | None) -> dict[str, Any]:
-    """Errors of one detector in one clip, and of the poses by images and its keypoints."""
+    """Errors of one detector in one clip, and of the poses from images and its keypoints."""
     given = given_of(folder, limit)
     found, spent = seen_by(detector, given)
     mean, varying = image_errors(given.clip, found)
@@ -92,7 +91,7 @@ def measure(only: Sequence[str] = CLIPS, *, seed: int = 0, quick: bool = False) 
     """Errors by clip and detector.
 
     Raises:
-        FileNotFoundError: the clips are not there.
+        FileNotFoundError: the clips are missing.
         ValueError: no detector is installed, or a clip can not be read.
     """
     installed = [name for name, kind in DETECTORS.items() if kind.is_installed()]
@@ -109,7 +108,7 @@ def measure(only: Sequence[str] = CLIPS, *, seed: int = 0, quick: bool = False) 
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """A table of clips, and one of means, real clips first."""
+    """Tables of means and of clips, real clips first."""
     rows = result['rows']
     detectors = list(dict.fromkeys(row['detector'] for row in rows))
     shown = {'px': '.1f', 'varying_px': '.1f', 'heaviest_mm': '.0f', 'best_mm': '.0f', 'ms': '.0f'}

@@ -1,8 +1,8 @@
-"""experts: what the predictor that ships says of the images of clips with truth, and its speed.
+"""experts: accuracy of the bundled predictor on images of clips with truth, and its speed.
 
-Masks are the true ones, those of background subtraction with the empty scene, and of real people
-those of a detector, where it is installed. Where the truth has no hips, joints are compared from
-the middle of the shoulders. Nobody of the clips was learned from.
+Masks are the true ones, those of background subtraction with the empty scene, and for real people
+those of a detector, if installed. If the truth has no hips, joints are compared relative to the
+middle of the shoulders. No person of the clips is in the training data.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from msg_tools.files.array_file import read_archive
 Mask = NDArray[np.uint8]
 
 BEST_OF = 5
-QUICK = 8  # images
+QUICK = 8  # number of images with --quick
 STEP = 2  # interval of the images
 TRUE, SUBTRACTED, DETECTED = 'true', 'subtracted', 'detected'
 # Clips of real people.
@@ -103,7 +103,7 @@ def speed(folder: Path, seconds: float) -> dict[str, float]:
 
 
 def of_clip(work: tuple[Path, int | None]) -> dict[str, dict[str, float]]:
-    """Scores of a clip by kind of mask; empty: nothing shows silhouettes."""
+    """Scores of a clip by kind of mask; empty if there are no masks."""
     clip, predictor = read_clip(*work), load_predictor()
     masks: dict[str, list[Mask]] = {}
     if clip.background is not None:
@@ -128,7 +128,7 @@ def true_masks(clip: Clip) -> list[Mask] | None:
 
 
 def detected_masks(images: Sequence[Image], stamps: Sequence[int]) -> list[Mask]:
-    """The masks that the usual detector finds in images; empty where it finds none."""
+    """The masks that the default detector finds in images; empty if it finds nobody."""
     detector = DETECTORS[USUAL_DETECTOR].make(with_mask=True)
     result = []
     for image, stamp in zip(images, stamps, strict=True):
@@ -178,7 +178,7 @@ def _origin(truth: Truth) -> tuple[str, ...]:
 def predictions(
     predictor: PosePredictor, clip: Clip, masks: Sequence[Mask], rows: NDArray[np.intp]
 ) -> dict[int, GaussianMixture]:
-    """Mixtures over poses by the row of the image, of those that show somebody and have truth."""
+    """Mixtures over poses by image index, for images with a silhouette and with truth."""
     result: dict[int, GaussianMixture] = {}
     for i in rows.tolist():
         if clip.stamps[i] in clip.truth.joints:
@@ -197,7 +197,7 @@ def true_depths(truth: Truth, stamps: Sequence[int]) -> NDArray[np.float64]:
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """A table for people."""
+    """Human-readable table."""
     head = [
         'clip',
         'masks',

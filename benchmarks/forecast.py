@@ -1,9 +1,9 @@
-"""forecast: where the tracker says that a person will be, against holding the last pose.
+"""forecast: the tracker's predictions of future poses, compared with holding the last pose.
 
-The tracker follows all clips with known truth, gravity given. From each image it predicts the pose
-at times after it: `forecast`, as `pose_forecast` has it. Beside it stand the pose of that image,
-held, and moved on at the velocity of the mode; and what the pose errs by in its own image, which no
-forecast from it can do without.
+The tracker follows all clips with known truth, with given gravity. After each image it predicts the
+pose at later times: `forecast`, as in `pose_forecast`. This is compared with the pose of that image
+held, and moved at the velocity of the mode; and with the error of the pose in its own image, which
+is the least that a forecast can have.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from hmt_ros.evaluation.track_scores import Estimate, TrackScorer
 from hmt_ros.inference import GaussianMixture
 from msg_tools.messages.headers import SECOND_NS
 
-AHEAD = (0.1, 0.2, 0.5)  # s
+AHEAD = (0.1, 0.2, 0.5)  # times of the forecasts after an image, s
 FORECAST, HELD, CONSTANT, THEN = 'forecast', 'held', 'constant velocity', 'in its own image'
 WAYS = (FORECAST, HELD, CONSTANT, THEN)
-QUICK = 12  # images
-# The truth nearest to a time that is asked for is at most so far away, s.
+QUICK = 12  # number of images with --quick
+# Maximum difference between the time of a forecast and that of the nearest truth, s.
 NEAR = 0.02
 
 
 class Work(NamedTuple):
-    """A clip, and how it is seen."""
+    """A clip, the inputs of the tracker, and the maximum number of images or None."""
 
     folder: Path
     inputs: str
@@ -67,7 +67,7 @@ def of_clip(work: Work) -> dict[str, dict[str, float]]:
             for way, (at, mixture) in made.items():
                 scorers[f'{way} {ahead:g}'].take(_estimate(at, mixture, tracker.estimate.body))
     found = {name: scorer.finish().scores.summary() for name, scorer in scorers.items()}
-    # None: the truth has no such time.
+    # None if the truth has no such time.
     scores = {
         name: [np.nan if one[x] is None else one[x] for x in ('heaviest_mm', 'joint_coverage_90')]
         for name, one in found.items()
@@ -82,10 +82,10 @@ def _estimate(stamp: int, mixture: GaussianMixture, body: Body) -> Estimate:
 
 
 def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]:
-    """What `of_clip` finds on the clips, and means over groups of clips.
+    """Scores of `of_clip` for all clips, as means over groups of clips.
 
     Raises:
-        ValueError: none are there, or one can not be read.
+        ValueError: there are no clips, or one can not be read.
     """
     folders = find_clips(clips, quick=quick)[0]
     folders = [
@@ -120,7 +120,7 @@ def _mean(scores: list[dict[str, dict[str, float]]], name: str) -> dict[str, flo
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """A table for people."""
+    """Human-readable table."""
     rows = [['inputs', 'ahead', *WAYS, 'forecast : held', '90 % regions']]
     for group in dict.fromkeys(x['clips'] for x in result['means']):
         rows.append([group, *[''] * (len(rows[0]) - 1)])

@@ -1,8 +1,8 @@
-"""gate: fails where a step of the tracker costs more than the table in gate.json says.
+"""gate: fails if a step of the tracker costs more than the limit in gate.json.
 
-Processor time is in floors, OpenCV's own work on the same images in the same run (`tracking --parts
-speed`), so that machines and loads can be compared. The lower of two runs counts. --write puts what
-was measured into the table.
+The unit of processor time is the floor, OpenCV's work on the same images in the same run (`tracking
+--parts speed`), so that machines and loads can be compared. The lower of two runs is used. --write
+stores the measured values in the table.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from benchmarks.machine import description
 from benchmarks.tracking_speed import PRICED, costs
 
 TABLE = Path(__file__).with_name('gate.json')
-# What is above the table by this factor is too much.
+# Maximum accepted factor above the table.
 MARGIN = 1.15
 RUNS, QUICK = 2, 12
 
@@ -29,10 +29,10 @@ RUNS, QUICK = 2, 12
 def floors_of(
     clips: Path | None = None, *, quick: bool = False
 ) -> tuple[str, dict[str, dict[str, float]]]:
-    """Where the clips are from, and floors of a step by inputs and rate: the mean over the clips.
+    """Source of the clips, and mean floors of a step over the clips, by inputs and rate.
 
     Args:
-        clips: their folder; None: the development clips, or bags/.
+        clips: folder of the clips; None means the development clips, or bags/.
         quick: one run, and few images.
 
     Raises:
@@ -62,7 +62,7 @@ def compared(
     found: Mapping[str, Mapping[str, float]],
     limits: Mapping[str, Mapping[str, Mapping[str, float]]],
 ) -> list[dict[str, Any]]:
-    """Rows of what was measured beside the table; `over` where it is too much.
+    """Rows of measured values and table values; `over` is true for too much.
 
     Raises:
         ValueError: the table lacks these clips, inputs or rates.
@@ -92,14 +92,14 @@ def compared(
 def measure(
     clips: Path | None = None, *, quick: bool = False, write: bool = False
 ) -> dict[str, Any]:
-    """What a step costs, beside the table.
+    """Costs of a step, compared with the table.
 
     Args:
         clips, quick: as for `floors_of`.
-        write: whether the table takes over what is measured.
+        write: whether to store the measured values in the table.
 
     Raises:
-        ValueError: there is nothing to measure on, or to compare with.
+        ValueError: there are no clips, or no table to compare with.
     """
     limits = read_table(TABLE)
     source, found = floors_of(clips, quick=quick)
@@ -114,7 +114,7 @@ def measure(
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """What is printed."""
+    """Human-readable table."""
     head = ['inputs', 'rate', 'floors', 'table', '']
     rows = [
         [x['inputs'], x['rate'], f'{x["floors"]:.1f}', f'{x["table"]:.1f}',
@@ -125,12 +125,12 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
 
 
 def read_table(path: Path) -> dict[str, Any]:
-    """Floors by clips, inputs and images a second, as checked in; empty if missing."""
+    """Checked-in floors by clips, inputs and images per second; empty if missing."""
     return dict(json.loads(path.read_text('utf-8'))) if path.is_file() else {}
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Runs the command; 1: a step costs too much, or nothing can be compared."""
+    """Runs the command; returns 1 if a step costs too much or nothing can be compared."""
     parser = benchmark_parser('gate', __doc__, quick=f'one run over {QUICK} images of one clip')
     parser.add_argument('--clips', type=Path, help='folder of the clips')
     parser.add_argument('--write', action='store_true', help='write the table')

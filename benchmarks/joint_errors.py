@@ -1,13 +1,13 @@
-"""joint_errors: what joints err by in every pose, and what all images leave of a covariance.
+"""joint_errors: pose-independent errors of joints, and scale of the pose covariances.
 
-Modes k of a pose say of a joint j, with the covariances C_jk that they have because of the pose,
+With covariances C_jk from those of the pose, the modes k predict for a joint j
 
     p(x_j) = sum_k w_k N(x_j; m_jk, t C_jk + s_j^2 I)
 
-For some t, s_j is such that the 90 % regions of joint j, relative to the pelvis, hold the true
-joint in 90 % of the images of the clips that settings are chosen on, with all three inputs alike.
-What was made of it stands in `joint_errors` of `hmt_ros/body/models/human37.yaml`, and in
-`TOGETHER` of `hmt_ros/inference/error_model.py`, which is part of the C_jk.
+For each t, s_j is chosen such that the 90 % regions of joint j, relative to the pelvis, contain the
+true joint in 90 % of the images of the clips used for settings, over all three inputs together.
+Results are in `joint_errors` of `hmt_ros/body/models/human37.yaml`, and in `TOGETHER` of
+`hmt_ros/inference/error_model.py`, which is part of the C_jk.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from hmt_ros.inference.mixture import GaussianMixture
 
 Array = NDArray[np.float64]
 
-EVERY = 6  # images
+EVERY = 6  # interval of the used images
 HELD = 0.9
 SAMPLES = 100
 # Values of t, and the bounds of s, m.
@@ -44,14 +44,14 @@ HALVINGS = 6
 
 
 class Said(NamedTuple):
-    """What a track says of one joint in one image, relative to the pelvis or absolute.
+    """Distribution of one joint in one image, relative to the pelvis or absolute.
 
     Attributes:
-        joint: of the body, right for left.
+        joint: name of the joint; left ones are named as the right ones.
         relative: whether it is relative to the pelvis.
-        weights: (K,) of the modes.
-        means: (K, 3) less the true position, m.
-        covariances: (K, 3, 3) because of the pose, m^2.
+        weights: (K,) weights of the modes.
+        means: (K, 3) means minus the true position, m.
+        covariances: (K, 3, 3) covariances from the pose, m^2.
     """
 
     joint: str
@@ -62,7 +62,7 @@ class Said(NamedTuple):
 
 
 def said_of(folder: Path, inputs: str, limit: int | None = None) -> list[Said]:
-    """What the tracker says of the joints of a clip, with some of `runs.INPUTS`.
+    """Distributions of the joints of a clip, with one of `runs.INPUTS`.
 
     Raises:
         ValueError: the clip can not be read.
@@ -108,7 +108,7 @@ def levels_and_densities(said: Sequence[Said], share: float, error: float) -> Ar
 
 
 def error_that_holds(said: Sequence[Said], share: float) -> tuple[float, Array]:
-    """s whose regions of probability `HELD` hold as many true joints; levels and densities."""
+    """The s for which regions of level `HELD` cover as many true joints; levels and densities."""
     low, high = LEAST, MOST
     found = np.empty((0, 2))
     for _ in range(HALVINGS):
@@ -122,7 +122,7 @@ def error_that_holds(said: Sequence[Said], share: float) -> tuple[float, Array]:
 
 
 def learned(said: Sequence[Said]) -> list[dict[str, Any]]:
-    """For each t: s_j in mm, mean log density of a joint, shares held by 50 and 90 % regions."""
+    """For each t: s_j in mm, mean log density of a joint, coverage of 50 and 90 % regions."""
     names = list(dict.fromkeys(one.joint for one in said))
     relative, absolute = (
         {name: [x for x in said if x.joint == name and x.relative == kind] for name in names}
@@ -148,12 +148,12 @@ def learned(said: Sequence[Said]) -> list[dict[str, Any]]:
 
 
 def _held(numbers: Array) -> list[float]:
-    """Shares of levels, of `levels_and_densities`, in regions of 50 and 90 %."""
+    """Coverage of 50 and 90 % regions, from `levels_and_densities`."""
     return [float((numbers[:, 0] <= p).mean()) for p in (0.5, 0.9)]
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """What is printed."""
+    """Human-readable table."""
     joints = list(result['shares'][0]['errors_mm'])
     rows = [
         ['t', *(f's of {joint.removeprefix("right_")}, mm' for joint in joints), 'log density',
@@ -172,7 +172,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
 
 
 def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]:
-    """What `learned` finds on the clips that settings are chosen on.
+    """Results of `learned` on the clips used for settings.
 
     Raises:
         FileNotFoundError: there are no clips.

@@ -1,10 +1,10 @@
-"""keep_out: how often a true joint is outside the space that a robot is told to keep out of.
+"""keep_out: how often a true joint is outside the keep-out space of a robot.
 
-The tracker follows all clips with known truth, gravity given, at several rates of images. In each
-image that it answers, a joint is missed that lies in none of `keep_out_capsules`. Beside the misses
-stands the volume, against that of the capsules of the heaviest mode, which are exact and wider by
-0.1 m: a curve over the probability that is asked for. So it is in the second after a second without
-images, too.
+The tracker follows all clips with known truth, with given gravity, at several image rates. A joint
+is missed if it lies in none of `keep_out_capsules` of an answered image. Misses and volumes are
+given as functions of the requested probability; volumes are relative to the capsules of the
+heaviest mode without uncertainty, widened by 0.1 m. The same is measured in each second after a
+second without images.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from hmt_ros.body.keep_out import MARGIN, Capsules, keep_out_capsules
 from msg_tools.messages.headers import SECOND_NS
 
 PROBABILITIES = (0.9, 0.95, 0.99, 0.997)
-AFTER_GAPS = 0.0  # in place of a rate
+AFTER_GAPS = 0.0  # stands for a rate
 RATES = (30.0, 8.0, 3.0, AFTER_GAPS)
-GAP = SECOND_NS  # that images and gaps last, in turn
-# Images a second that are looked at, at most.
+GAP = SECOND_NS  # duration of alternating images and gaps
+# Maximum number of scored images per second.
 LOOKS = 5.0
-# By how much the capsules are wider that volumes are compared with, m; random points of a volume.
+# Margin of the capsules used as the unit of volume, m; number of random points for a volume.
 WIDER, SAMPLES = 0.1, 4_000
-QUICK = 12  # images
+QUICK = 12  # number of images with --quick
 
 
 class Work(NamedTuple):
-    """A clip, and how it is seen; see `smoothing.Work`."""
+    """A clip and its conditions; see `smoothing.Work`."""
 
     folder: Path
     inputs: str
@@ -77,7 +77,7 @@ def of_clip(work: Work) -> dict[str, list[float]]:
 
 
 def volume(capsules: Capsules) -> float:
-    """Of their union, m^3, by random points in the box around it."""
+    """Volume of the union of capsules, m^3, by random points in its bounding box."""
     reach = capsules.radii[:, None]
     low = (np.minimum(capsules.starts, capsules.ends) - reach).min(0)
     high = (np.maximum(capsules.starts, capsules.ends) + reach).max(0)
@@ -86,10 +86,10 @@ def volume(capsules: Capsules) -> float:
 
 
 def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]:
-    """What `of_clip` finds on the clips, and means over groups of clips.
+    """Scores of `of_clip` for all clips, as means over groups of clips.
 
     Raises:
-        ValueError: none are there, or one can not be read.
+        ValueError: there are no clips, or one can not be read.
     """
     folders = find_clips(clips, moving=True, quick=quick)[0]
     folders = [
@@ -123,7 +123,7 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """A table for people."""
+    """Human-readable table."""
     rows = [
         ['inputs', 'images a second', *(f'{p:g}: missed, volume' for p in result['probabilities'])]
     ]

@@ -1,7 +1,7 @@
-"""kernels: what compiled code takes, and an evaluation of a pose term by term.
+"""kernels: times of compiled functions, and of the evaluation of a pose by term.
 
---against FOLDER measures in a checkout of another commit, too, built as that commit wants it, in
-turn with this one, and gives the ratios.
+--against FOLDER also measures in a checkout of another commit, which must be built, alternating
+with this one, and prints the ratios.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ CAMERA = Camera(660.0, 660.0, 319.5, 239.5, 640, 480)
 PLACING, ALL = 'frames of the segments', 'all together'
 # Kinds of derivatives by the name of their columns.
 KINDS = {'value': Derivatives.NONE, 'sums': Derivatives.POSITIVE}
-# Poses of one call whose evaluations are measured; runs in each of two checkouts.
+# Number of poses in a measured call; number of runs in each of two checkouts.
 POSES, RUNS = 64, 5
 QUICK = (PLACING, 'keypoints', 'motion')
 
@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """Tables for people."""
+    """Human-readable tables."""
     ratios = 'ratio' in result['cases'][0]
     rows = [['what', 'batch', 'ms', *(['of the other'] if ratios else [])]]
     for one in result['cases']:
@@ -88,8 +88,8 @@ def measure(*, quick: bool = False, against: Path | None = None) -> dict[str, An
     """Times of compiled functions, and of the evaluation of a pose.
 
     Args:
-        quick: less long, and fewer terms.
-        against: another checkout; the medians of runs in turn count.
+        quick: shorter measurements of fewer terms.
+        against: another checkout, compared by the medians of alternating runs.
 
     Raises:
         RuntimeError: the other checkout can not be measured.
@@ -116,7 +116,7 @@ def measure(*, quick: bool = False, against: Path | None = None) -> dict[str, An
 
 
 def _measured_in(folder: Path, *, quick: bool) -> Any:
-    """What this benchmark prints in a checkout."""
+    """Result of this benchmark in a checkout."""
     paths = [str(folder), *filter(None, os.environ.get('PYTHONPATH', '').split(os.pathsep))]
     command = [sys.executable, '-m', 'benchmarks', 'kernels', '--json']
     done = subprocess.run(
@@ -142,7 +142,7 @@ def _median(runs: Sequence[Any]) -> Any:
 
 
 def _cases(seconds: float) -> Iterator[dict[str, Any]]:
-    """Times of the choice of hypotheses, of flips and of self-intersection, ms."""
+    """Times of selecting hypotheses, of flips and of self-intersection, ms."""
     body, rng = load_body('human37'), np.random.default_rng(0)
     joints, log_weights = rng.normal(0, 0.1, (256, 19, 3)), rng.normal(0, 3, 256)
     poses = _any_poses(128)
@@ -161,7 +161,7 @@ def _cases(seconds: float) -> Iterator[dict[str, Any]]:
 
 
 def _evaluation(seconds: float, names: Sequence[str] | None) -> Iterator[dict[str, Any]]:
-    """Times of one evaluation, us; those of terms on top of the frames of the segments."""
+    """Times of one evaluation, us; terms without the time for the frames of the segments."""
     every, poses = energies(POSES)
     placed = dict.fromkeys(KINDS, 0.0)
     for what in names or every:
@@ -183,7 +183,7 @@ def _evaluation(seconds: float, names: Sequence[str] | None) -> Iterator[dict[st
 
 
 def energies(poses: int) -> tuple[dict[str, PoseEnergy], Array]:
-    """Energies of a person who walks, one term each and all together, and so many poses (N, d)."""
+    """Energies of a walking person, for each term and for all, and random poses (N, d)."""
     body = load_body('human37')
     view = Viewpoint(distance=3.6)
     shown = procedural_motion('walk', body, 0.8, 10.0, 3, viewpoint=view)[4:6]

@@ -1,11 +1,11 @@
-"""keypoint_noise: where a detector's landmarks lie on the body, and how they err.
+"""keypoint_noise: positions of a detector's landmarks on the body, and their errors.
 
-The poses of the body, with the true lengths, that come nearest to the true joints of rendered
-clips. Of every landmark the offset from its joint, in the frame of the joint's segment, that
-explains the detector's pixels best (robust least squares, both sides mirrored onto the right); the
-deviations that are left, in m at the person, by confidence and from image to image, and how much of
-their variance lasts; depths of the joints that the detector lifts; how often it takes left for
-right. What was made of it stands in `hmt_ros/image/keypoint_schemes.yaml`.
+The body, with the true lengths, is fitted to the true joints of rendered clips. For every landmark
+this gives the offset from its joint, in the frame of the joint's segment, that explains the
+detector's pixels best (robust least squares, both sides mirrored onto the right); the remaining
+deviations, in m at the person, by confidence and from image to image, and their correlation in
+time; errors of the depths that the detector estimates; and how often it exchanges left and right.
+`hmt_ros/image/keypoint_schemes.yaml` contains the results.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ LIMBS = {
     'legs': ('knee', 'ankle', 'heel', 'foot_index'),
 }
 IMAGES_APART = (1, 2, 5, 10, 20)
-# Deviations count up to this in correlations, m.
+# Bound to which deviations are clipped for correlations, m.
 FURTHEST = 0.1
-# Images a second of the clips; median of the absolute of a Gaussian, in deviations.
+# Frame rate of the clips, Hz; median absolute value of a Gaussian, in standard deviations.
 RATE, MEDIAN = 30.0, 0.6745
 KINDS = ('none', 'all', 'arms', 'legs')
-# Fewer are no sample.
+# Minimum number of errors in a bin.
 FEWEST = 20
 
 
@@ -59,12 +59,12 @@ class Seen:
     """One landmark in the images of one clip, M of them.
 
     Attributes:
-        name: of the landmark; of the left one it is mirrored to the right.
+        name: name of the landmark; left ones are mirrored to the right.
         by_offset: (M, 2, 3) derivative of the pixel by the offset, over the magnification.
-        errors: (M, 2) pixel less that of the joint, over the magnification, m.
-        confidences: (M,).
-        images: (M,) numbers, increasing.
-        apart: (M,) from the landmark of the other side, m on the person; NaN for the nose.
+        errors: (M, 2) pixel minus that of the joint, over the magnification, m.
+        confidences: (M,) confidences of the detector.
+        images: (M,) image numbers, increasing.
+        apart: (M,) distance from the other side's landmark, m on the person; NaN for the nose.
     """
 
     name: str
@@ -77,7 +77,7 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Clips:
-    """What was found in clips: landmarks, exchanges image by image, errors of depths by joint."""
+    """Results for clips: landmarks, exchange in each image, errors of depths by joint."""
 
     seen: list[Seen]
     exchanges: list[NDArray[np.intp]]
@@ -85,10 +85,10 @@ class Clips:
 
 
 def measured(folder: Path, limit: int | None = None) -> Clips:
-    """What the detector says of one clip, beside the truth.
+    """Compares a detector's keypoints of one clip with the truth.
 
     Raises:
-        ValueError: it can not be read, or has no keypoints.
+        ValueError: the clip can not be read or has no keypoints.
     """
     clip, body, starts = fitted(folder, limit)
     detections = read_detections(folder).keypoints
@@ -127,7 +127,7 @@ def _landmarks(
     found: Sequence[Keypoints],
     exchanges: NDArray[np.intp],
 ) -> list[Seen]:
-    """Landmarks of images in which nothing is exchanged, both sides as the right one."""
+    """Landmarks in images without an exchange of sides; left ones are mirrored to the right."""
     frames = forward(body.skeleton, poses)
     columns, _ = frames.by_pose()
     truth = {name: i for i, name in enumerate(clip.truth.joint_names)}
@@ -186,7 +186,7 @@ def _depths(
     poses: Array,
     exchanges: NDArray[np.intp],
 ) -> list[tuple[str, Array]]:
-    """Measured less true depths of the joints that were lifted, from the hips, by joint, m."""
+    """Estimated minus true depths of lifted joints relative to the hips, by joint, m."""
     skeleton, result = body.skeleton, []
     hips = skeleton.joint_index(HIPS)
     for keypoints, pose, exchange in zip(found, poses, exchanges, strict=True):
@@ -214,7 +214,7 @@ def robust_offset(by_offset: Array, errors: Array) -> Array:
 
 
 def correlation(errors: Sequence[Array], images: Sequence[NDArray[np.intp]], apart: int) -> float:
-    """Correlation of errors (M, 2) of the same landmark so many images apart."""
+    """Correlation of errors (M, 2) of the same landmark, `apart` images apart."""
     product, square = 0.0, 0.0
     for own, when in zip(errors, images, strict=True):
         clipped = np.clip(own, -FURTHEST, FURTHEST)
@@ -281,7 +281,7 @@ def summary(found: Sequence[Clips]) -> dict[str, Any]:
 
 
 def _by_bin(errors: Array, by: Array, bins: Sequence[float]) -> list[dict[str, Any]]:
-    """Deviations of errors (M, 2) by the bins of another number (M,)."""
+    """Standard deviations of errors (M, 2) by bins of another quantity (M,)."""
     result = []
     for low, high in pairwise(bins):
         inside = errors[(by >= low) & (by < high)]
@@ -294,9 +294,9 @@ def _by_bin(errors: Array, by: Array, bins: Sequence[float]) -> list[dict[str, A
 
 
 def lasting_shares(correlations: dict[str, float]) -> dict[str, float]:
-    """Shares of the variance that differ from image to image, last for `time` s, and stay.
+    """Shares of the variance that are white, last for the time `time`, s, and are constant.
 
-    The least squares that keep all shares positive, at the time that fits best.
+    Non-negative least squares for the shares, at the time that fits best.
     """
     gaps = np.array([int(n) for n in correlations]) / RATE
     wanted = np.array(list(correlations.values()))
@@ -313,7 +313,7 @@ def lasting_shares(correlations: dict[str, float]) -> dict[str, float]:
 
 
 def robust_sigma(errors: Array) -> float:
-    """Deviation of a coordinate by the median distance of errors (M, 2), as of a Gaussian."""
+    """Standard deviation of a coordinate from the median norm of errors (M, 2), if Gaussian."""
     return float(np.median(np.linalg.norm(errors, axis=1)) / np.sqrt(2.0 * np.log(2.0)))
 
 
@@ -321,12 +321,12 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
     """Offsets and errors of the landmarks over clips.
 
     Args:
-        clips: folder of the clips; None: the development clips.
+        clips: folder of the clips; None means the development clips.
         quick: a few images of one clip.
 
     Raises:
-        FileNotFoundError: a clip is not there.
-        ValueError: a clip that can not be used.
+        FileNotFoundError: a clip is missing.
+        ValueError: a clip can not be used.
     """
     wanted = CLIPS[:QUICK] if quick else CLIPS
     folders = with_file(wanted, clips, 'keypoints_mediapipe.npz')

@@ -1,4 +1,4 @@
-"""kjs: kinematic jumps against random sampling at finding minima, Table 1 of KJS."""
+"""kjs: kinematic jumps compared with random sampling in the search for minima, Table 1 of KJS."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ from hmt_ros.tracking.proposals.sampling import covariance_scaled_samples, spher
 Array = NDArray[np.float64]
 
 CAMERA = Camera(1000.0, 1000.0, 480.0, 360.0, 960, 720)
-DISTANCE = 3.0  # m, of the pelvis
-SIGMA = 1.0  # px, of an image joint
-# The soft prior only holds what the image leaves open, as the stabilisers of the paper do.
+DISTANCE = 3.0  # distance of the pelvis, m
+SIGMA = 1.0  # standard deviation of an image joint, px
+# The soft prior only fixes what the image leaves open, like the stabilisers of the paper.
 PRIOR_WEIGHT = 0.01
 OUT_OF_PLANE = np.radians(10.0)
-DRAWN = 20_000  # poses from which the one of the table is chosen
-SAMPLES, QUICK_SAMPLES = 2000, 20  # of each random row
-APART = 0.01  # m: minima of which no joint differs by as much are one
-ALIKE = 10.0  # nats above the start, within which a minimum explains the image as well
+DRAWN = 20_000  # number of poses from which that of the table is chosen
+SAMPLES, QUICK_SAMPLES = 2000, 20  # number of samples of each random row
+APART = 0.01  # minimum difference of a joint between distinct minima, m
+ALIKE = 10.0  # maximum energy above the start of a minimum that explains the image as well, nats
 ITERATIONS = 200
-RUNS = 3  # of each row, for the CPU time
+RUNS = 3  # number of runs of each row, for the CPU time
 COUNTS = ('samples', 'unconverged', 'minima', 'alike')
 RATIOS = ('minima_per_sample', 'alike_per_sample', 'minima_per_cpu_s')
-SCALES = (1.0, 4.0, 8.0, 16.0, 0.0)  # 0: Cauchy tails
+SCALES = (1.0, 4.0, 8.0, 16.0, 0.0)  # 0 selects Cauchy tails
 PARTITIONS = {
     'both arms, left calf': ('left_arm', 'right_arm', 'left_leg'),
     'both calves, right arm': ('left_leg', 'right_leg', 'right_arm'),
@@ -56,13 +56,13 @@ LINKS = (
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """A person before a camera, the joints in the image, and the minimum that sampling starts from.
+    """A person in front of a camera, image joints, and the minimum from which sampling starts.
 
     Attributes:
-        body: of the person.
+        body: body of the person.
         energy: energy term of the joints and the priors.
-        start: the minimum next to the true pose.
-        covariance: (d, d) inverse Hessian there.
+        start: minimum nearest to the true pose.
+        covariance: (d, d) inverse Hessian at the start.
     """
 
     body: Body
@@ -72,7 +72,7 @@ class Setting:
 
     @property
     def pose(self) -> Array:
-        """Of the start, (d,)."""
+        """Pose (d,) of the start."""
         result: Array = self.start.x[0]
         return result
 
@@ -82,10 +82,10 @@ class Samples:
     """Samples before and after optimisation.
 
     Attributes:
-        sampler, scale: what they are of.
-        raw: (N, d) as they were drawn.
-        costs: (N,) of those, above the start.
-        optimised: what came of them.
+        sampler, scale: name of the sampler and its scale.
+        raw: (N, d) poses as drawn.
+        costs: (N,) energies of the raw poses above the start.
+        optimised: minima reached from the raw poses.
         minima: indices of the distinct minima, best first.
         seconds: CPU time of drawing and optimising, s.
     """
@@ -111,10 +111,10 @@ def main(argv: list[str]) -> int:
 
 
 def measure(count: int = SAMPLES, seed: int = 0, runs: int = RUNS) -> dict[str, Any]:
-    """All rows of the table, of each the fastest of some runs."""
+    """All rows of the table, each with the fastest of several runs."""
     body = load_body('human34')
     setting = setting_of(body, chosen_pose(body))
-    # Compiled code is read before anything is timed.
+    # A warm-up loads compiled code before anything is timed.
     for found in all_samples(setting, 4, seed, 1):
         row(setting, found)
     rows = [row(setting, found) for found in all_samples(setting, count, seed, runs)]
@@ -130,7 +130,7 @@ def measure(count: int = SAMPLES, seed: int = 0, runs: int = RUNS) -> dict[str, 
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """Tables for people."""
+    """Human-readable tables."""
     head = [
         'sampler', 'scale', *COUNTS, 'distance', 'optimised', 'deviations', 'optimised',
         'cost', 'optimised', 'CPU s', 'minima / s',
@@ -174,9 +174,9 @@ def all_samples(setting: Setting, count: int, seed: int, runs: int) -> Iterator[
 
 
 def kinematic_jumps(setting: Setting, name: str, runs: int = 1) -> Samples:
-    """All leaves of the product of the trees of some chains.
+    """Samples from all leaves of the product of the trees of some chains.
 
-    Nothing is pruned but by the limits, as the optimiser is to say what is a minimum.
+    Only the limits prune leaves, because the optimiser decides what is a minimum.
     """
     draw = partial(enumerate_flips, setting.body, setting.pose, PARTITIONS[name])
     return sampled(setting, name, '', lambda: draw()[0], runs)
@@ -185,7 +185,7 @@ def kinematic_jumps(setting: Setting, name: str, runs: int = 1) -> Samples:
 def sampled(
     setting: Setting, sampler: str, scale: str, draw: Callable[[], Array], runs: int
 ) -> Samples:
-    """Draws samples and optimises them, some times over, of which the fastest counts."""
+    """Draws samples and optimises them in several runs; the time is that of the fastest."""
     times = []
     for _ in range(runs):
         start = time.process_time()
@@ -205,7 +205,7 @@ def minima_of(body: Body, optimised: Minimum) -> NDArray[np.intp]:
 
 
 def row(setting: Setting, found: Samples) -> dict[str, Any]:
-    """What the table says about samples; medians of raw and of optimised ones."""
+    """Table row of samples, with medians over raw and over optimised ones."""
     optimised = found.optimised.value - setting.start.value[0]
     converged = found.optimised.status == Status.CONVERGED
     distances = [distances_from(setting, x) for x in (found.raw, found.optimised.x[converged])]
@@ -236,7 +236,7 @@ def distances_from(setting: Setting, poses: Array) -> tuple[Array, Array]:
 
 
 def ratios(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Rows of kinematic jumps against the best of CSS in each column; in cost, of SS too."""
+    """Ratios of kinematic jumps to the best row of CSS by column; for the cost, of CSS and SS."""
     jumps = [r for r in rows if not r['scale']]
     spread = [r for r in rows if r['sampler'] == 'CSS']
     random = [r for r in rows if r['scale']]
@@ -250,7 +250,7 @@ def ratios(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 
 def setting_of(body: Body, pose: Array) -> Setting:
-    """The joints of a pose as the camera sees them, and the minimum next to it."""
+    """Setting with the projected joints of a pose, and the minimum nearest to it."""
     pixels = CAMERA.project(body.joint_positions(pose[None]))[0]
     n = len(pixels)
     keypoints = Keypoints(
@@ -266,7 +266,7 @@ def setting_of(body: Body, pose: Array) -> Setting:
 
 
 def optimise(body: Body, energy: Any, poses: Array) -> Minimum:
-    """Minima next to poses (N, d), within the limits."""
+    """Minima near poses (N, d), within the limits."""
     return minimise(
         energy, poses, body.lower, body.upper,
         step_scale=np.where(body.skeleton.dof_is_rotation, 0.4, 0.3),
@@ -275,7 +275,7 @@ def optimise(body: Body, energy: Any, poses: Array) -> Minimum:
 
 
 def drawn_poses(body: Body, count: int = DRAWN) -> Array:
-    """Poses (n, d) of the prior that face the camera and in which no parts intersect."""
+    """Poses (n, d) drawn from the prior that face the camera, without self-intersection."""
     rng = np.random.default_rng(0)
     sigma = np.where(np.isfinite(body.prior_sigma), body.prior_sigma, 0.0)
     poses = body.prior_mean + sigma * rng.normal(size=(count, body.dimension))
@@ -289,7 +289,7 @@ def drawn_poses(body: Body, count: int = DRAWN) -> Array:
 def chosen_pose(body: Body) -> Array:
     """The pose of the table.
 
-    Of those drawn whose links all leave the image plane, the one with most leaves.
+    It has the most leaves of the drawn poses whose links all leave the image plane.
     """
     poses = drawn_poses(body)
     poses = poses[out_of_plane(body, poses) > OUT_OF_PLANE]
@@ -304,7 +304,7 @@ def leaf_counts(body: Body, poses: Array, chain: str) -> Array:
 
 
 def out_of_plane(body: Body, poses: Array) -> Array:
-    """The least angle (N,) between a link of the limbs and the plane across its ray, rad."""
+    """Minimum angle (N,) between a limb's link and the plane perpendicular to its ray, rad."""
     joints = body.joint_positions(poses)
     angles = []
     for side in ('left', 'right'):

@@ -1,10 +1,10 @@
 """lifting: poses from keypoints alone, without images and without a track, on clips with truth.
 
-The mixtures of `experts.lifter` on a real detector's keypoints, with later images and without,
-gravity given and not, lengths usual or measured:
-distances of the heaviest and of the best pose, of the heaviest after the similarity that fits best,
-slanted limbs whose slope has the wrong sign, and regions of single joints. The detector's own 3D
-stands beside. Clips that settings were chosen on, and the others, apart.
+Mixtures of `experts.lifter` on a real detector's keypoints, with and without later images, with and
+without gravity, with usual or measured lengths. Scores: errors of the heaviest and of the best
+pose, of the heaviest after the best similarity transform, share of slanted limbs with a wrong sign
+of the slope, and coverage of single joints. The detector's own 3D is given for comparison. Clips
+used for settings are separate from the others.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from hmt_ros.experts.lifter import SHIPPED, KeypointHistory, load_lifter
 from hmt_ros.tracking import read_subject
 from hmt_ros.tracking.initialisation import start_from_keypoints
 
-QUICK = 12  # images
+QUICK = 12  # number of images with --quick
 SCORES = (
     'heaviest_mm', 'best_mm', 'aligned_mm', 'wrong_sign', 'joint_coverage_90', 'weights',
 )  # fmt: skip
 HEADS = ('heaviest', 'best', 'PA', 'wrong sign, %', '90 % regions, %', 'log(K w)')
 IMAGES, LENGTHS = ('all images', 'causal'), ('usual', 'known')
 CONDITIONS = tuple(product(IMAGES, (UNKNOWN, GIVEN), LENGTHS))
-# Images that the cost is the median of.
+# Number of images for the median cost.
 TIMED = 60
 
 
 def lifted(work: tuple[Path, str, tuple[str, str, str], int | None]) -> dict[str, float]:
-    """Scores of one clip: folder, lifter, what is known, and the number of images; None: all."""
+    """Scores of one clip, given folder, lifter, conditions, and number of images or None."""
     folder, model, (images, gravity, lengths), limit = work
     clip, usual = read_clip(folder, limit), load_body('human37')
     found = read_detections(folder).keypoints
@@ -98,8 +98,8 @@ def measure(
     """Scores over clips.
 
     Args:
-        clips: folder of the clips; None: the development clips.
-        model: lifter.
+        clips: folder of the clips; None means the development clips.
+        model: name or file of the lifter.
         quick: the first images of one clip.
     """
     folders, source = find_clips(clips, moving=True)
@@ -147,7 +147,7 @@ def _cells(entry: dict[str, Any]) -> list[str]:
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """The numbers as tables; mm unless said."""
+    """The numbers as tables; mm unless stated otherwise."""
     parts = []
     for group in dict.fromkeys(x['clips'] for x in result['means']):
         rows = [[group, 'gravity', 'lengths', *HEADS]]

@@ -1,17 +1,17 @@
-"""live: the nodes at the images of a camera that does not wait for them.
+"""live: the nodes with a camera that does not wait for them.
 
-A clip with known truth is rendered (`benchmarks.live_clips`). A camera, in a process of its own,
-shows it to the real nodes at its rate, on the same machine; a third process listens. Keypoints are
-the true joints with the noise of a detector, behind each image, or those of MediaPipe, which then
-computes beside the nodes. Latency is the time from when an image is due at the camera to the
-arrival of its pose_mixture; age is how much older a smoothed pose is, when it arrives, than the
-newest image. The clip of the dancer is replayed offline too, where every image is used. Where CPU
-time goes in replay and live is sampled, in runs of their own.
+A clip with known truth is rendered (`benchmarks.live_clips`). A camera process publishes it to the
+real nodes at its frame rate, on the same machine; a third process listens. Keypoints are the true
+joints with detector noise, published after each image, or those of MediaPipe, which then competes
+with the nodes for the processor. Latency is the time from when an image is due at the camera to the
+arrival of its pose_mixture; age is the time from the image of a smoothed pose to the newest image
+when the pose arrives. The clip of the dancer is also replayed offline, using every image. Separate
+runs sample the distribution of CPU time in replay and live.
 
-Somebody who visits an empty scene: `keep_out` may not say NOBODY of an image with half of the
-joints or more in it, and has to say it from a second on after the last of them has left. Of several
-people `people` is what is listened to. --runs repeats each case and shows medians; --minutes shows
-the clip back and forth for so long.
+In a visit a person enters and leaves an empty scene: `keep_out` must not report NOBODY for an image
+with half of the joints or more, and must report it from one second after the last joint has left.
+With several people the topic `people` is scored. --runs repeats each case and shows medians;
+--minutes plays the clip back and forth for this time.
 """
 
 from __future__ import annotations
@@ -80,11 +80,11 @@ POSTERIOR, SMOOTHED = 'pose_mixture', 'smoothed_pose_mixture'
 TOLD, LISTED = 'keep_out', 'people'
 # Options of a replay that leaves out the gravity of the bag.
 WITHOUT_GRAVITY = ('--set', 'gravity_frame=', '--set', 'fixed_frame=')
-# As `person_node` has them beside the filter.
+# Options that add the experts, as in `person_node`.
 WITH_EXPERTS = ('--bme', '--set', 'bme.tracked_interval=0.2')
-START_SECONDS = 120.0  # until the person is tracked
-PATIENCE = 3.0  # s, after the last image
-# Of a visit: how long a state may be late, s, and the share of the joints that are somebody.
+START_SECONDS = 120.0  # maximum time until the person is tracked, s
+PATIENCE = 3.0  # wait after the last image, s
+# Maximum delay of a state in a visit, s, and minimum share of visible joints of a person.
 LATE, SOMEBODY = 1.0, 0.5
 PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
@@ -113,7 +113,7 @@ def measure(
     runs: int = 1,
     minutes: float | None = None,
 ) -> dict[str, Any]:
-    """Fate of the images of a camera that does not wait."""
+    """Runs the cases with a camera that does not wait."""
     with tempfile.TemporaryDirectory(prefix='benchmark_live.') as name:
         folder = Path(name)
 
@@ -131,7 +131,7 @@ def measure(
 
 
 def offline(clip: Path, target: Path, *given: str) -> dict[str, Any]:
-    """The clip in lock step: every image, by the parameters of the nodes; its bag tells gravity."""
+    """Replays every image of the clip with the parameters of the nodes; the bag has gravity."""
     start = time.perf_counter()
     _replay(clip, target, *given)
     truth = read_truth(clip / 'truth.npz')
@@ -148,7 +148,7 @@ def _replay(clip: Path, target: Path, *given: str) -> None:
 
 
 def sampled_replay(clip: Path, target: Path) -> dict[str, Any]:
-    """Where the time of a replay goes, with the experts beside filter and smoother."""
+    """Profile of a replay with filter, smoother and experts."""
     with StackSampler() as sampler:
         _replay(clip, target, *WITHOUT_GRAVITY, *WITH_EXPERTS)
     return {'profile': profile_of(sampler.samples(), len(_stamps(clip)))}
@@ -184,7 +184,7 @@ def _tried(
 
 
 def sampled(clip: Path, target: Path, case: Case, minutes: float | None) -> dict[str, Any]:
-    """Where the time of the nodes goes while the clip moves, for each image that is answered."""
+    """Profile of the nodes while the clip moves, per answered image."""
     file = target.with_suffix('.json')
     with patch.dict(os.environ, {PROFILE_FILE: str(file)}):
         found = live(clip, target, case, minutes)
@@ -195,7 +195,7 @@ def sampled(clip: Path, target: Path, case: Case, minutes: float | None) -> dict
 
 
 def median_of(found: Sequence[Any]) -> Any:
-    """Medians of the numbers of several runs, in the structure of each."""
+    """Medians of the numbers of several runs, in the same nested structure."""
     first = found[0]
     if isinstance(first, dict):
         return {key: median_of([each[key] for each in found if key in each]) for key in first}
@@ -207,16 +207,16 @@ def median_of(found: Sequence[Any]) -> Any:
 
 
 def live(clip: Path, target: Path, case: Case, minutes: float | None = None) -> dict[str, Any]:
-    """The clip through the real nodes, at the rate of the camera, once or back and forth.
+    """Plays the clip to the real nodes at the camera's rate, once or back and forth.
 
     Raises:
-        LiveNodeError: there is no ROS, or a node does not start or track.
+        LiveNodeError: ROS is missing, or a node does not start or track.
     """
     rate, own = rate_of(case.clip), _stamps(clip)
     planned = len(own) if minutes is None else round(60 * minutes * rate)
     indices = [index_back_and_forth(number, len(own)) for number in range(planned)]
     step = round(1e9 / rate)
-    # As `benchmarks.camera` has them; which image of the clip each is.
+    # Timestamps of published images, as in `benchmarks.camera`, and of their images in the clip.
     shows = {
         own[0] + (own[i] - own[0] if i == k else k * step): own[i] for k, i in enumerate(indices)
     }
@@ -238,7 +238,7 @@ def live(clip: Path, target: Path, case: Case, minutes: float | None = None) -> 
             opened, player.domain, clip, case.transport, len(stamps), more,
             subscribers=1 if case.keypoints or case.together else 2, rate=rate,
         )  # fmt: skip
-        # The track has started before the clip moves.
+        # Wait until the track has started before the clip moves.
         topic = _topic_of(case)
         camera.spin(player, lambda: len(arrived[topic]) > 2, START_SECONDS)
         shift, start_ns = camera.begin(player)
@@ -285,7 +285,7 @@ def live(clip: Path, target: Path, case: Case, minutes: float | None = None) -> 
             float(np.median(part)) for part in (latencies[: count // 4], latencies[-count // 4 :])
         ],
         'memory_mb': memory_mb,
-        # In all, and in the second half, by when everything has happened once.
+        # In total, and in the second half, when everything has happened at least once.
         'grown_mb': memories[-1] - memories[0] if memories else 0.0,
         'grown_later_mb': memories[-1] - memories[len(memories) // 2] if memories else 0.0,
         'cpu_s': dict(zip((node.name for node in processes), spent, strict=True)),
@@ -318,7 +318,7 @@ def live(clip: Path, target: Path, case: Case, minutes: float | None = None) -> 
 
 
 def _topic_of(case: Case) -> str:
-    """What answers an image."""
+    """The topic that answers an image."""
     if case.people:
         return LISTED
     return TOLD if case.clip == VISIT else POSTERIOR
@@ -330,13 +330,13 @@ def _stamps(clip: Path) -> list[int]:
 
 
 def _listed(messages: Mapping[int, bytes]) -> dict[str, Any]:
-    """Of how many people the answers tell, on average."""
+    """Mean number of people in the answers."""
     counts = [len(deserialise(data, PEOPLE_2D).ids) for data in messages.values()]
     return {'people': float(np.mean(counts))}
 
 
 def told_of_a_visit(messages: Mapping[int, bytes], clip: Path, rate: float) -> dict[str, Any]:
-    """Whether the states of the answers are those of the images."""
+    """Compares the reported states of a visit with its images."""
     shares = shares_in_view(clip)
     stamps = sorted(shares)
     late = round(LATE * rate)
@@ -344,13 +344,13 @@ def told_of_a_visit(messages: Mapping[int, bytes], clip: Path, rate: float) -> d
         stamp: KeepOutState(int(deserialise(data, KEEP_OUT).state))
         for stamp, data in messages.items()
     }
-    # What has been so for as long as an answer may be late.
+    # Shares in view during the time by which an answer is allowed to be late.
     lasting = {
         stamp: [shares[each] for each in stamps[max(k - late, 0) : k + 1]]
         for k, stamp in enumerate(stamps)
     }
     whole = [states[x] for x in states if min(lasting[x]) == 1.0]
-    # Before anybody has come the state is UNKNOWN.
+    # The state is UNKNOWN until a person has entered.
     came = min(stamp for stamp in stamps if shares[stamp] > 0.0)
     away = [states[x] for x in states if x > came and max(lasting[x]) == 0.0]
     return {
@@ -366,7 +366,7 @@ def told_of_a_visit(messages: Mapping[int, bytes], clip: Path, rate: float) -> d
 
 
 def _listen(player: Player, case: Case) -> dict[str, list[tuple[int, bytes, int]]]:
-    """Lists that fill with stamp, bytes and time of arrival of what arrives, by topic."""
+    """Subscribes; the lists, by topic, collect timestamp, bytes and arrival time of messages."""
     from hmt_msgs.msg import KeepOut, People2D, PoseMixture
 
     kinds = {POSTERIOR: PoseMixture, SMOOTHED: PoseMixture, TOLD: KeepOut, LISTED: People2D}
@@ -376,7 +376,7 @@ def _listen(player: Player, case: Case) -> dict[str, list[tuple[int, bytes, int]
         messages.append((stamp_in(data), data, time.monotonic_ns()))
 
     for topic, messages in arrived.items():
-        # What nobody listens to is not made.
+        # A node does not produce a topic without subscribers.
         if topic == TOLD and not case.keep_out:
             continue
 
@@ -388,17 +388,17 @@ def _listen(player: Player, case: Case) -> dict[str, list[tuple[int, bytes, int]
 
 
 def _received(player: Player, node: LiveNode) -> int:
-    """Images that have reached a node, by its diagnostics, which come once a second."""
+    """Number of images received by a node, from its diagnostics, published once a second."""
     return int(player.diagnostics.get(node.name, {}).get('images received', '0'))
 
 
 def _shifted(data: bytes, stamp_ns: int) -> bytes:
-    """A mixture with the stamp of its image in the bag, as it is stored."""
+    """Serialised mixture with the timestamp of its image in the bag."""
     return canonical(with_stamp(data, stamp_ns), POSE_MIXTURE)
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """Tables for people: one person in view, a visit, several people."""
+    """Human-readable tables: one person in view, a visit, several people."""
     found = {stage: result[stage] for stage in STAGES if stage in result}
     profiles = {
         'replay' if stage == REPLAY else CASES[stage].what: found.pop(stage)['profile']

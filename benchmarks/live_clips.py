@@ -1,9 +1,9 @@
-"""The clips that cameras show in the benchmark `live`: rendered, with known truth.
+"""Clips for the benchmark `live`: rendered, with known truth.
 
-dance      a dancer in view all the time
-large      the same in more pixels, at a slower rate
-visit      somebody walks into an empty scene and backwards out of it
-people N   dancers beside each other, with detections of all
+dance      a dancer, always in view
+large      the same with more pixels, at a lower rate
+visit      a person walks into an empty scene, and backwards out of it
+people N   dancers side by side, with detections of all
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.headers import FRAME_ID
 from msg_tools.messages.keypoints import keypoints_message
 
-RATE, SLOWER = 30.0, 15.0  # images a second
+RATE, SLOWER = 30.0, 15.0  # images per second
 MOTION = 'dance'
 LARGE, VISIT, PEOPLE = 'large', 'visit', 'people'
-# Standard deviation of keypoints, as a share of the height of the person in the image.
+# Standard deviation of keypoints relative to the height of the person in the image.
 NOISE = 0.01
-# The longest interval between two people beside each other, m.
+# Distance between two neighbouring people, m.
 APART = 1.3
-# How long somebody walks into the image, and how long nobody is there before and after, s.
+# Duration of walking into the image, and of the empty scene before and after, s.
 WALK, AWAY = 3.5, 3.0
-# Where the walk begins, m to the left of the middle of the image.
+# Start of the walk, m to the left of the middle of the image.
 OUTSIDE = 3.6
 CAMERA = Camera(660.0, 660.0, 319.5, 239.5, 640, 480)
 
 
 def make_clip(folder: Path, name: str, seconds: float) -> Path:
-    """Renders a clip, unless it is there; its folder.
+    """Renders a clip unless it exists; returns its folder.
 
     Raises:
-        ValueError: it can not be made.
+        ValueError: rendering fails.
     """
     target = folder / name
     if not target.exists():
@@ -61,7 +61,7 @@ def make_clip(folder: Path, name: str, seconds: float) -> Path:
 
 
 def rate_of(name: str) -> float:
-    """Images of a clip a second."""
+    """Images per second of a clip."""
     return SLOWER if name == LARGE else RATE
 
 
@@ -73,7 +73,7 @@ def run(command: Callable[[list[str]], int], arguments: list[str]) -> None:
     """Runs a command of the package.
 
     Raises:
-        ValueError: it fails.
+        ValueError: the command fails.
     """
     if code := command(arguments):
         raise ValueError(f'{" ".join(arguments)} ended with {code}')
@@ -89,7 +89,7 @@ def _make_visit(target: Path) -> None:
 
 
 def _make_people(target: Path, count: int, seconds: float) -> None:
-    """Dancers beside each other, the middle one in the middle of the image."""
+    """Renders dancers side by side, centred in the image."""
     body, viewpoint = load_body('human37'), Viewpoint()
     takes = []
     for number in range(count):
@@ -100,7 +100,7 @@ def _make_people(target: Path, count: int, seconds: float) -> None:
 
 
 def noisy_keypoints(clip: Path) -> Path:
-    """A bag with `keypoints` of each image: the true joints with the noise of a detector."""
+    """A bag with `keypoints` of each image: the true joints with detector noise."""
     target = clip / 'keypoints'
     if target.exists():
         return target
@@ -124,7 +124,7 @@ def noisy_keypoints(clip: Path) -> Path:
 
 
 def shares_in_view(clip: Path) -> dict[int, float]:
-    """Share of the joints of the person of a visit that lie in the image, by stamp."""
+    """Share of the visitor's joints that lie in the image, by timestamp."""
     info, _ = read_messages(clip, [COMPRESSED], 1)
     with np.load(clip / 'truth_a.npz') as truth:
         pixels, stamps = truth['pixels'], truth['stamps']

@@ -23,25 +23,25 @@ from hmt_ros.sessions.keypoints_session import KeypointsParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 
-GLANCE = 5.0  # s, between two looks at the memory
+GLANCE = 5.0  # interval between two checks of the memory, s
 PERSON, PEOPLE_NODE, DETECTOR = 'person_node', 'people_node', 'keypoints_node'
 
 
 @dataclass(frozen=True)
 class Case:
-    """How the nodes are run.
+    """Configuration of the nodes in a run.
 
     Attributes:
-        what: in words.
-        clip: that is shown, see `benchmarks.live_clips`.
-        transport: of the images.
-        keypoints: whether there are any; then there is no BME.
-        detector: whether MediaPipe finds them, on the same machine.
+        what: description.
+        clip: name of the clip, see `benchmarks.live_clips`.
+        transport: image transport.
+        keypoints: whether keypoints are given; then there are no BME experts.
+        detector: whether MediaPipe detects the keypoints, on the same machine.
         together: whether the nodes run in one process.
-        smoothed: whether there is a smoother.
-        keep_out: whether a robot listens to what it keeps out of.
-        gravity: whether it is given.
-        sampled: whether the one process is, see `benchmarks.sampling`.
+        smoothed: whether the smoother runs.
+        keep_out: whether a robot subscribes to the keep-out space.
+        gravity: whether gravity is given.
+        sampled: whether the process is profiled, see `benchmarks.sampling`.
     """
 
     what: str
@@ -57,7 +57,7 @@ class Case:
 
     @property
     def people(self) -> int:
-        """Number of people, where `people_node` follows them; else 0."""
+        """Number of people tracked by `people_node`; 0 if it is not used."""
         kind, _, number = self.clip.partition(' ')
         return int(number) if kind == PEOPLE else 0
 
@@ -103,7 +103,7 @@ CASES = {
 
 
 def start_nodes(player: Player, opened: ExitStack, clip: Path, case: Case) -> list[LiveNode]:
-    """The nodes as the launch file starts them; the one that tracks is the first."""
+    """Starts the nodes as the launch file does; the tracking node is the first."""
     from hmt_ros.nodes.person_node import used_of_each_other
 
     images = {
@@ -147,7 +147,7 @@ def start_nodes(player: Player, opened: ExitStack, clip: Path, case: Case) -> li
 
 
 class CameraProcess:
-    """The process that shows the clip."""
+    """The process that publishes the clip."""
 
     def __init__(
         self,
@@ -173,7 +173,7 @@ class CameraProcess:
         self.latest_ns = 0
 
     def begin(self, player: Player) -> tuple[int, int]:
-        """Sets the clip in motion; by how much its stamps are later, and when it begins, ns."""
+        """Starts the clip; returns the shift of its timestamps and its start time, ns."""
         self._say()
         assert self._process.stdout is not None
         shift, start = self._process.stdout.readline().split()
@@ -194,7 +194,7 @@ class CameraProcess:
         seconds: float,
         every: Callable[[], None] = lambda: None,
     ) -> None:
-        """Listens until something is done; does something else every few seconds.
+        """Listens until a condition holds; calls `every` every few seconds.
 
         Raises:
             LiveNodeError: it takes too long, or the camera has ended.
@@ -217,7 +217,7 @@ class CameraProcess:
 
 
 def cpu_seconds(node: LiveNode) -> float:
-    """Time that the process of a node has computed, s."""
+    """Processor time used by the process of a node, s."""
     fields = Path(f'/proc/{node.process.pid}/stat').read_text('utf-8').rpartition(')')[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
@@ -226,8 +226,8 @@ def memory(node: LiveNode, part: str = 'Pss') -> float:
     """Memory of the process of a node, MB.
 
     Args:
-        part: 'Pss', with its share of files that other processes have in memory, too, or
-            'Pss_Anon', without any: other processes do not change that.
+        part: 'Pss', including its share of memory shared with other processes, or 'Pss_Anon',
+            without files, so that other processes do not change it.
     """
     text = Path(f'/proc/{node.process.pid}/smaps_rollup').read_text('utf-8')
     (line,) = (line for line in text.splitlines() if line.startswith(f'{part}:'))
@@ -235,4 +235,4 @@ def memory(node: LiveNode, part: str = 'Pss') -> float:
 
 
 def _ignored(topic: str, stamp: int, data: bytes) -> None:
-    """Results are listened to elsewhere."""
+    """Ignored, because results are received elsewhere."""

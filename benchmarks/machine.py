@@ -1,4 +1,4 @@
-"""What a time is measured with: repeated timing, the machine's own speed, memory."""
+"""Measurement tools: repeated timing, speed of the machine, memory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import scipy
 
 
 def best_time(function: Callable[[], Any], *, seconds: float = 1.0, least: int = 3) -> float:
-    """Shortest of several runs, s, which nothing else disturbed; the first is not counted."""
+    """Shortest time of several runs, s; the first run is not counted."""
     function()
     times: list[float] = []
     end = time.perf_counter() + seconds
@@ -27,20 +27,20 @@ def best_time(function: Callable[[], Any], *, seconds: float = 1.0, least: int =
 
 
 def dgemm_rate(size: int = 768) -> float:
-    """Floating-point operations per second of a product of matrices, as numpy's BLAS is set."""
+    """Floating-point operations per second of a matrix product with numpy's BLAS settings."""
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, size, size))
     return 2.0 * size**3 / best_time(lambda: a @ b, seconds=0.5)
 
 
 def description() -> dict[str, Any]:
-    """Processor, cores that may be used, and versions."""
+    """Processor, number of usable cores, and versions."""
     model = ''
     info = Path('/proc/cpuinfo')
     if info.is_file():
         lines = info.read_text('utf-8').splitlines()
         model = next((x.partition(':')[2].strip() for x in lines if x.startswith('model name')), '')
-    # Here, so that a process whose memory is measured does not hold it.
+    # Imported here, so that it is not in the memory of measured processes.
     import cv2
 
     return {
@@ -54,7 +54,7 @@ def description() -> dict[str, Any]:
 
 
 def on_machine(machine: dict[str, Any]) -> str:
-    """A line for the foot of a table."""
+    """Description of a machine in one line, for the foot of a table."""
     versions = ', '.join(f'{name} {machine[name]}' for name in ('python', 'numpy', 'opencv'))
     return f'{machine["processor"]}, {machine["cores"]} cores; {versions}.'
 
@@ -62,14 +62,14 @@ def on_machine(machine: dict[str, Any]) -> str:
 def peak_memory(process: int | str = 'self') -> float:
     """Largest resident memory of a process since it began, or since `forget_peak`, bytes.
 
-    Not `ru_maxrss`: a process inherits that of the one that started it.
+    `ru_maxrss` is not used, because a process inherits it from its parent.
     """
     lines = Path(f'/proc/{process}/status').read_text('utf-8').splitlines()
     return 1024.0 * float(next(line.split()[1] for line in lines if line.startswith('VmHWM:')))
 
 
 def forget_peak(process: int | str = 'self') -> None:
-    """From now on `peak_memory` tells of what follows."""
+    """Resets the peak that `peak_memory` returns."""
     Path(f'/proc/{process}/clear_refs').write_text('5', 'utf-8')
 
 

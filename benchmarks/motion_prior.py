@@ -1,9 +1,9 @@
-"""How well the motion prior predicts motions of people from whom it did not learn.
+"""Quality of the motion prior's predictions for people outside its training data.
 
-Poses are filtered with a noise of 0.01 rad or m. In every step the surprise is compared with the
-prediction: its log density, and the share of steps whose surprise lies inside the region of 90 %,
-of all degrees of freedom together and of each one alone. Beside the learned prior stand the random
-walk at the rates of the body, and the same with 0.7 of a velocity that is kept.
+Poses are filtered with a noise of 0.01 rad or m. Scores are the log density of the innovation under
+the prediction in every step, and the share of innovations inside the 90 % region, for all degrees
+of freedom together and for each. The learned prior is compared with a random walk at the rates of
+the body, and with the same plus 0.7 of the previous velocity.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.motion_states import PredictedStates
 
 Array = NDArray[np.float64]
-# What is seen before a pose: how far it may be from where it was predicted, and what that costs.
+# Pairs of the innovation (d,) of a pose and its predicted covariance (d, d).
 Surprises = Iterator[tuple[Array, Array]]
 
 SHARED = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared'))
 NOISE = 0.01  # rad and m
-STEPS = (1, 3, 6)  # frames of 30 Hz
-KEPT, GAIN = 0.7, 0.5  # of the velocity, for the random walk that keeps one
-# Motions of the folder whose second part is faulty, and where that begins.
+STEPS = (1, 3, 6)  # intervals, in frames of 30 Hz
+KEPT, GAIN = 0.7, 0.5  # shares of the velocity kept and updated, for the random walk with velocity
+# Motions with a faulty second part, and its first frame.
 CUT = {'cmu_14_traffic': 720}
 
 
 def filtered(dynamics: LinearGaussianDynamics, poses: Array, interval: float) -> Surprises:
-    """Surprises (d,) of a filter and their covariances (d, d)."""
+    """Innovations (d,) of a filter and their covariances (d, d)."""
     d = dynamics.dimension
     noise = NOISE**2 * np.eye(d)
     state = np.zeros((1, dynamics.state_dimension))
@@ -63,7 +63,7 @@ def filtered(dynamics: LinearGaussianDynamics, poses: Array, interval: float) ->
 
 
 def walking(rates: Array, kept: float) -> Callable[[Array, float], Surprises]:
-    """Surprises of a random walk with a share of a velocity that follows the displacements."""
+    """Innovations of a random walk plus a share of a smoothed velocity."""
 
     def surprises(poses: Array, interval: float) -> Surprises:
         velocity = np.zeros(poses.shape[1])
@@ -76,7 +76,7 @@ def walking(rates: Array, kept: float) -> Callable[[Array, float], Surprises]:
 
 
 def scores(surprises: list[tuple[Array, Array]]) -> dict[str, float]:
-    """Mean log density, and shares inside the region of 90 %."""
+    """Mean log density, and shares inside 90 % regions."""
     densities, inside, alone = [], [], []
     for surprise, spread in surprises:
         factor = np.linalg.cholesky(spread)
@@ -97,11 +97,11 @@ def measure(folder: Path | None = None, *, quick: bool = False) -> dict[str, Any
     """Scores by interval and model.
 
     Args:
-        folder: of motions; None: the development motions.
+        folder: folder of motions; None means the development motions.
         quick: a few poses of one motion.
 
     Raises:
-        FileNotFoundError: the development data is not there.
+        FileNotFoundError: the development data are missing.
         ValueError: the folder has no motions.
     """
     if folder is None:
@@ -130,7 +130,7 @@ def measure(folder: Path | None = None, *, quick: bool = False) -> dict[str, Any
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = True) -> str:
-    """A table, which is always one for a Markdown page."""
+    """A table, always in Markdown."""
     head = '| interval | model | log density a step | all inside 90 % | each inside 90 % |'
     lines = [head, '|---|---|---:|---:|---:|']
     for interval, models in result.items():
@@ -144,7 +144,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = True) -> str:
 
 
 def main(argv: list[str]) -> int:
-    """Runs the benchmark; 1: there are no motions."""
+    """Runs the benchmark; returns 1 if there are no motions."""
     parser = benchmark_parser('motion_prior', __doc__, quick='a few poses of one motion')
     parser.add_argument('--mocap', type=Path, help='folder of motions (the development motions)')
     options = parser.parse_args(argv)

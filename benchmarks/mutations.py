@@ -1,4 +1,4 @@
-"""Messages and files that nobody would write: valid ones with damage."""
+"""Damaged messages and files, made from valid ones."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import struct
 
 import numpy as np
 
-# Numbers at which code breaks, as they stand in CDR.
+# Numbers that often break code, as stored in CDR.
 _INTEGERS = (0, 1, 2, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1)
 _FLOATS = (0.0, -0.0, -1.0, 1e-320, 1e300, -1e300, float('inf'), float('-inf'), float('nan'))
 WORDS = [struct.pack('<I', x) for x in _INTEGERS] + [struct.pack('<d', x) for x in _FLOATS]
-# Damage is most telling where lengths, stamps and names are.
+# Size of the head with lengths, timestamps and names, where damage is most effective, bytes.
 _HEAD = 256
 _MOST_CHANGES = 4
-# How often each kind of damage: most other than of bits and words can not even be read.
+# Probabilities of the numbers and kinds of damage; kinds except bits and words prevent reading.
 _COUNTS = (0.6, 0.2, 0.1, 0.1)
 _KINDS = (0.35, 0.35, 0.06, 0.06, 0.06, 0.06, 0.06)
 
 
 def damaged(data: bytes, rng: np.random.Generator) -> bytes:
-    """Bytes with up to four kinds of damage: bits, words, pieces that are cut or doubled, ends."""
+    """Bytes with up to four kinds of damage: bits, words, cut or doubled pieces, cut ends."""
     content = bytearray(data)
     for _ in range(int(rng.choice(_MOST_CHANGES, p=_COUNTS)) + 1):
         reach = min(len(content), _HEAD) if rng.random() < 0.5 else len(content)

@@ -1,4 +1,4 @@
-"""nodes: what ROS adds to an image: a node whose estimate costs nothing, through DDS."""
+"""nodes: latency added by ROS and DDS, with a node whose estimate costs nothing."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import compressed_image_message, decode_image, image_message
 
-RATE = 30.0  # images a second
+RATE = 30.0  # images per second
 SECONDS, QUICK_SECONDS = 20.0, 1.0
-WARM_UP = 10  # images before it counts
-PATIENCE = 2.0  # s after the last image; much more for the first
+WARM_UP = 10  # number of images before the measurement
+PATIENCE = 2.0  # wait after the last image, s; much longer for the first
 SIZE, IMAGES = (640, 480), 30
-MEDIAN_MS, LATE_MS = 5.0, 15.0  # wanted of what ROS adds, median and 99th percentile
-# Images that may wait: no node is late, but images come in bursts.
+MEDIAN_MS, LATE_MS = 5.0, 15.0  # maximum added latency, median and 99th percentile
+# Queue size, because images come in bursts although no node is late.
 QUEUE = 5
 FIRST_NS, STEP_NS = 10**18, round(1e9 / RATE)
-# Room in shared memory for raw images.
+# Profile of DDS with enough shared memory for raw images.
 PROFILE = Path(hmt_ros.__file__).parent / 'config' / 'fastdds.xml'
 TRANSPORTS = {'raw': 'ROS alone, 640x480 bgr8', 'compressed': 'ROS alone, 640x480 JPEG'}
 
@@ -53,7 +53,7 @@ def main(argv: list[str]) -> int:
 
 
 def measure(only: tuple[str, ...] = tuple(TRANSPORTS), *, quick: bool = False) -> dict[str, Any]:
-    """What comes of images at the rate of a camera, by their transport."""
+    """Latency and losses of images at camera rate, by transport."""
     seconds = QUICK_SECONDS if quick else SECONDS
     stages = {name: partial(_tried, name, seconds) for name in TRANSPORTS}
     with patch.dict(os.environ, {'FASTRTPS_DEFAULT_PROFILES_FILE': str(PROFILE)}):
@@ -100,7 +100,7 @@ def added(transport: str, seconds: float) -> dict[str, Any]:
 
 
 class _Heard:
-    """The node, what it was shown, and when results came."""
+    """The node, with times of its images and results."""
 
     def __init__(self, transport: str, player: Player, opened: ExitStack) -> None:
         self.sent: dict[int, float] = {}
@@ -125,7 +125,7 @@ class _Heard:
         )
 
         def heard(data: bytes) -> None:
-            # The stamp opens the message; to read the rest takes longer than to receive it.
+            # The timestamp comes first; deserialising the rest would take longer than receiving it.
             now = time.perf_counter()
             seconds, nanoseconds = np.frombuffer(data, '<i4', 2, 4).tolist()
             self.arrived[seconds * 10**9 + nanoseconds] = now
@@ -144,7 +144,7 @@ class _Heard:
         self.node.publish_bytes(IMAGE, with_stamp(data, stamp))
 
     def wait(self, player: Player) -> None:
-        """Returns when the last image is answered, or lost."""
+        """Waits until the last image is answered or lost."""
         stamp = next(reversed(self.sent))
         end = time.perf_counter() + (PATIENCE if self.arrived else 15 * PATIENCE)
         while stamp not in self.arrived and time.perf_counter() < end:
@@ -163,7 +163,7 @@ def _shown(transport: str) -> tuple[Any, Sequence[Any]]:
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """A table for people."""
+    """Human-readable table."""
     rows = [['30 images a second', 'images', 'results', 'median', '99 %', 'largest', '']]
     for transport, what in TRANSPORTS.items():
         found = result.get(transport)
@@ -177,4 +177,4 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
 
 
 def _ignored(topic: str, stamp: int, data: bytes) -> None:
-    """Results are listened to elsewhere."""
+    """Ignored, because results are received elsewhere."""

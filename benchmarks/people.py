@@ -1,10 +1,10 @@
-"""people: two people cross, one before the other; does each keep the track that was theirs?
+"""people: two people cross, one in front of the other; does each keep the own track?
 
 For every seed a bag is rendered (`make-bag crossing`: 320x240, 3 s at 10 Hz, COCO keypoints of both
-without identities, none where a person is hidden) and replayed (`replay --people`). A track is that
-of the person to whose pelvis it is the nearer one, by depth and direction, in the first second;
-after the crossing each must still be. Errors are those of the joints from the pelvis, of the
-heaviest mode and of the best one, means of both people, mm.
+without identities, none for hidden joints) and replayed (`replay --people`). In the first second a
+track is assigned to the person with the nearest pelvis; this must still hold after the crossing.
+Errors are those of the joints relative to the pelvis, for the heaviest and for the best mode, means
+over both people, mm.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from msg_tools.messages.pose_mixtures import pose_mixture_of
 SEEDS = 10
 DURATION, FPS, SIZE = 3.0, 10.0, '320x240'
 QUICK_DURATION = 1.0
-# Shares of the time, before and after the crossing, in which people are compared with their tracks.
+# Ends of the compared times before and after the crossing, as fractions of the duration.
 BEFORE, AFTER = 0.33, 0.75
 
-# Positions (K, J, 3) of the joints of the modes, heaviest first, m, by stamp.
+# Positions (K, J, 3) of the joints of the modes, heaviest first, m, by timestamp.
 Joints = dict[int, Array]
 
 
@@ -53,7 +53,7 @@ def main(argv: list[str] | None = None) -> int:
 def measure(
     seeds: int = SEEDS, duration: float = DURATION, keep: Path | None = None
 ) -> dict[str, Any]:
-    """Scores of the crossings of some seeds; the bags stay in a folder, if one is given."""
+    """Scores of the crossings for all seeds; the bags are kept if a folder is given."""
     with tempfile.TemporaryDirectory() as folder:
         place = keep or Path(folder)
         rows = [one_crossing(seed, place, duration) for seed in told('people', range(seeds))]
@@ -76,7 +76,7 @@ def one_crossing(seed: int, folder: Path, duration: float) -> dict[str, Any]:
 
 
 def tracks_in(bag: Path) -> dict[str, tuple[tuple[str, ...], Joints]]:
-    """Names of the joints, and where the modes have them, by identity."""
+    """Joint names and joint positions of the modes, by identity."""
     result: dict[str, tuple[tuple[str, ...], Joints]] = {}
     with BagReader(bag) as read:
         topics = [name for name in read.topics if name.endswith('/pose_mixture')]
@@ -92,7 +92,7 @@ def tracks_in(bag: Path) -> dict[str, tuple[tuple[str, ...], Joints]]:
 def scores(
     truths: list[Truth], tracks: dict[str, tuple[tuple[str, ...], Joints]]
 ) -> dict[str, Any]:
-    """Whether each track stays with the person that it began with, and how far it is off."""
+    """Whether each track stays with its first person, and its errors."""
     stamps = sorted(truths[0].joints)
     early = stamps[: round(BEFORE * len(stamps))]
     late = stamps[round(AFTER * len(stamps)) :]
@@ -118,7 +118,7 @@ def scores(
 def _owner(
     truths: list[Truth], names: tuple[str, ...], joints: Joints, stamps: list[int]
 ) -> int | None:
-    """Number of the person to whom a track is nearest in most of some images; None: in none."""
+    """Index of the person nearest to a track in most of the images; None without images."""
     place, votes = names.index('pelvis'), np.zeros(len(truths))
     for stamp in stamps:
         if stamp in joints:
@@ -147,7 +147,7 @@ def _errors(truth: Truth, names: tuple[str, ...], joints: Joints, stamps: list[i
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """What was measured, as a table."""
+    """Human-readable table."""
     rows = result['crossings']
     columns = [name for name in rows[0] if name.endswith('mm')]
     lines = [

@@ -1,9 +1,9 @@
-"""bme_node with an estimate that costs nothing: what is left is what ROS adds to an image.
+"""bme_node with an estimate that costs nothing, so that only the cost of ROS remains.
 
     python -m benchmarks.prompt_node --ros-args --params-file FILE
 
-Everything else is the real node: subscription, queue, the thread that estimates, decoding of the
-image, and the message of a mixture of the usual size.
+Everything else is as in the real node: subscription, queue, estimating thread, decoding of the
+image, and a mixture message of the usual size.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hmt_ros.sessions.camera_session import WaitingImage
 
 
 class PromptSession(BmeSession):
-    """Says the same of every image."""
+    """A session with the same answer for every image."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
@@ -37,7 +37,7 @@ class PromptSession(BmeSession):
 
 
 class PromptNode(BmeNode):
-    """The node."""
+    """The node with this session."""
 
     SESSION = PromptSession
 

@@ -1,13 +1,13 @@
-"""real: real people, in a table of their own that stands before those of rendered ones.
+"""real: clips of real people, in a separate table before those of rendered ones.
 
-desk_1, desk_3       a man at a desk, waist up, by `track-video` with MediaPipe's keypoints; six
-                     joints, aligned at the middle of the shoulders, and the published deviation of
-                     the ankles, which no image shows
+desk_1, desk_3       a man at a desk, visible from the waist up, by `track-video` with MediaPipe's
+                     keypoints; six joints, aligned at the middle of the shoulders, and the
+                     published deviation of the ankles, which no image shows
 balance              a man on a beam, images and keypoints; joints aligned at the middle of the hips
-park_walk, leaflet   a place that is empty, then visited, images and keypoints; without truth
+park_walk, leaflet   an empty scene that is then visited, images and keypoints; without truth
 
-Truths are triangulated from other cameras: 8 to 20 mm are theirs. Beside the heaviest mode stands
-MediaPipe's own 3D.
+The truth is triangulated from other cameras and has errors of 8 to 20 mm. The heaviest mode is
+compared with MediaPipe's own 3D.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ DESKS, BEAM, VISITS = ('desk_1', 'desk_3'), 'balance', ('park_walk', 'leaflet')
 CLIPS = (*DESKS, BEAM, *VISITS)
 SIX = tuple(f'{side}_{x}' for x in ('shoulder', 'elbow', 'wrist') for side in ('left', 'right'))
 ANKLES = ('left_ankle', 'right_ankle')
-NEAR_NS = 20_000_000  # between a stamp of a truth and that of its image, at most
+NEAR_NS = 20_000_000  # maximum difference between timestamps of a truth and its image
 
 
 def of_desk(folder: Path, end: float | None = None) -> dict[str, Any]:
-    """Errors of six joints, mm, and the deviation of the ankles, cm; to a time `end`, s."""
+    """Errors of six joints, mm, and the deviation of the ankles, cm, until the time `end`, s."""
     options = [] if end is None else ['--end', str(end)]
     with tempfile.TemporaryDirectory() as made:
         with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
@@ -97,14 +97,14 @@ def _places(component: Any, mixture: Any) -> dict[str, Array]:
 
 
 def _from_shoulders(said: dict[str, Array], true: dict[str, Array]) -> float:
-    """Mean distance of joints, m, after the middles of the shoulders were made one."""
+    """Mean distance of joints, m, after alignment at the middle of the shoulders."""
     middles = [0.5 * (x['left_shoulder'] + x['right_shoulder']) for x in (said, true)]
     off = [said[x] - middles[0] - true[x] + middles[1] for x in true]
     return float(np.linalg.norm(off, axis=1).mean())
 
 
 def _deviation(mixture: Any) -> float:
-    """Root of the trace of the covariance of an ankle over all components, m, mean of both."""
+    """Root of the trace of an ankle's covariance over all components, m, mean of both ankles."""
     weights = np.array([x.weight for x in mixture.components])
     result = []
     for ankle in ANKLES:
@@ -119,7 +119,7 @@ def _deviation(mixture: Any) -> float:
 
 
 def of_beam(folder: Path, limit: int | None = None) -> dict[str, Any]:
-    """Errors of the heaviest mode by images and keypoints, and of the detector, mm."""
+    """Errors of the heaviest mode from images and keypoints, and of the detector, mm."""
     record = run(Run(folder, BOTH, 0, limit=limit))
     clip, detections = read_clip(folder, limit), read_detections(folder)
     names = [x for x in clip.truth.joint_names if x in detections.names]
@@ -140,7 +140,7 @@ def of_beam(folder: Path, limit: int | None = None) -> dict[str, Any]:
 
 
 def of_visit(folder: Path, limit: int | None = None) -> dict[str, Any]:
-    """Images in which MediaPipe sees somebody: tracked, and said to be empty."""
+    """Numbers of images in which MediaPipe sees a person, and of these tracked or called empty."""
     info, messages = read_messages(folder, frames=limit)
     detections = read_detections(folder)
     images = [decode_image(message) for message in messages]
@@ -162,7 +162,7 @@ def measure(only: tuple[str, ...] = CLIPS, *, quick: bool = False) -> dict[str, 
     """The table.
 
     Raises:
-        FileNotFoundError: the development data is not there.
+        FileNotFoundError: the development data are missing.
         ValueError: a clip can not be read.
     """
     with_file(only, None, 'keypoints_mediapipe.npz')
@@ -178,7 +178,7 @@ def measure(only: tuple[str, ...] = CLIPS, *, quick: bool = False) -> dict[str, 
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """A table for people."""
+    """Human-readable table."""
     rows = [['clip', 'tracked', 'said empty', 'error, mm', 'MediaPipe, mm', 'ankles +-, cm']]
     for one in result['rows']:
         of = one.get('seen', one['images'])

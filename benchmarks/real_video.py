@@ -2,13 +2,12 @@
 
 `park_walk` and `leaflet`, images and keypoints, at the camera's rate:
 
-held out    root mean square distance of joints of the heaviest mode from keypoints that the tracker
-            was not given: those of every third landmark, which changes from image to image, as a
-            share of the height of the keypoints;
-given       the same of those that it was given;
-feet        median speed of an ankle while the tracker says that the foot stands, m/s;
+held out    root mean square distance of the heaviest mode's joints from held-out keypoints (every
+            third landmark, others in each image), relative to the height of all keypoints;
+given       the same for the keypoints given to the tracker;
+feet        median speed of an ankle while the tracker reports that the foot stands, m/s;
 lengths     standard deviation over time of the sum of all lengths, relative;
-empty       images without anybody that have a track. See also `absence`.
+empty       number of images without a person that have a track. See also `absence`.
 """
 
 from __future__ import annotations
@@ -33,8 +32,8 @@ from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import decode_image
 
 Array = NDArray[np.float64]
-HELD_OUT = 3  # one landmark in so many
-STANDS = 0.8  # probability of contact above which a foot stands
+HELD_OUT = 3  # one of this many landmarks is held out
+STANDS = 0.8  # minimum probability of contact of a standing foot
 QUICK = 30
 
 
@@ -42,7 +41,7 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
     """Scores of the real videos.
 
     Raises:
-        FileNotFoundError: they are not there.
+        FileNotFoundError: the videos are missing.
     """
     scenes = SCENES[:1] if quick else SCENES
     names = [scene.name for scene in scenes]
@@ -54,14 +53,14 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """An image of a video and what the tracker made of it.
+    """An image of a video and the tracker after it.
 
     Attributes:
-        image: (H, W, 3).
-        index: of the image in the video.
-        stamp: ns.
-        keypoints: of the detector; None: it has not answered.
-        tracker: after the image.
+        image: (H, W, 3) image, BGR.
+        index: index of the image in the video.
+        stamp: timestamp, ns.
+        keypoints: keypoints of the detector; None if it gave no answer.
+        tracker: tracker after the image.
         tracked: whether there is a track.
     """
 
@@ -74,12 +73,12 @@ class Seen:
 
 
 def followed(folder: Path, limit: int | None = None, *, held_out: int = 0) -> Iterator[Seen]:
-    """A real video through the tracker, images and keypoints.
+    """Tracks a real video with images and keypoints.
 
     Args:
-        folder: of the video.
-        limit: number of images; None: all.
-        held_out: one landmark in so many is not given, another in each image; 0: all are given.
+        folder: folder of the video.
+        limit: maximum number of images; None means all.
+        held_out: one of this many landmarks is held out, others in each image; 0 holds out none.
     """
     info, messages = read_messages(folder, frames=limit)
     keypoints = read_detections(folder).keypoints
@@ -143,7 +142,7 @@ def _rms(values: list[float]) -> float:
 
 
 def _misses(one: Seen, joints: dict[str, Array]) -> Iterator[tuple[bool, float]]:
-    """Whether a keypoint was held out, and its distance from the joint, over the height."""
+    """Whether a keypoint was held out, and its distance from the joint relative to the height."""
     if one.keypoints is None or not one.keypoints.seen.any():
         return
     seen = one.keypoints.seen
@@ -157,7 +156,7 @@ def _misses(one: Seen, joints: dict[str, Array]) -> Iterator[tuple[bool, float]]
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """What is printed."""
+    """Human-readable table."""
     rows = [
         ['clip', 'images tracked', 'held out, % of the height', 'given, %',
          'standing feet, m/s', 'lengths, %', 'empty images with a track'],

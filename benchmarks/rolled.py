@@ -1,9 +1,9 @@
-"""rolled: a camera turned about its optical axis, its gravity given, against an upright one.
+"""rolled: a camera turned about its optical axis, with given gravity, against an upright one.
 
 Images, keypoints, calibration, truth and gravity of clips are turned by 15, 90 and 180 degrees, as
-a camera on its side or upside down would have seen the scene. `lift` takes the keypoints alone,
-`track` starts from keypoints and takes images, too. Nothing that is seen has changed: neither may
-the errors.
+a camera on its side or upside down would have seen the scene. `lift` uses the keypoints alone,
+`track` starts from keypoints and also uses images. The scene does not change, so the errors should
+not change either.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ Array = NDArray[np.float64]
 
 
 def turned(camera: Camera, degrees: float) -> tuple[Camera, Array]:
-    """A camera whose image is turned about the optical axis, and the map (2, 3) of its pixels.
+    """A camera turned about its optical axis, and the affine map (2, 3) to its pixels.
 
-    The image is as large as the whole of the turned one needs.
+    The image is large enough for the whole turned image.
     """
     angle = np.radians(degrees)
     cosine, sine = np.round((np.cos(angle), np.sin(angle)), 12)
@@ -65,7 +65,7 @@ def turned(camera: Camera, degrees: float) -> tuple[Camera, Array]:
 
 
 def rolled(clip: Clip, degrees: float) -> Clip:
-    """A clip as a camera sees it that is turned about its optical axis."""
+    """A clip as seen by a camera turned about its optical axis."""
     camera, pixels = turned(clip.camera, degrees)
     angle = np.radians(degrees)
     cosine, sine = np.round((np.cos(angle), np.sin(angle)), 12)
@@ -89,13 +89,13 @@ def rolled(clip: Clip, degrees: float) -> Clip:
 
 
 def rolled_keypoints(found: Keypoints, camera: Camera, degrees: float) -> Keypoints:
-    """The keypoints of a detector, where the turned camera has them; its 3D is left out."""
+    """Keypoints of a detector mapped to the turned camera, without its 3D positions."""
     _, pixels = turned(camera, degrees)
     return replace(found, pixels=found.pixels @ pixels[:, :2].T + pixels[:, 2], positions=None)
 
 
 def scored(work: tuple[Path, str, str, float, int]) -> float:
-    """Mean error of the heaviest mode, mm: clip, stage, gravity, angle, number of images."""
+    """Mean error of the heaviest mode, mm, given clip, stage, gravity, angle, number of images."""
     folder, stage, gravity, degrees, images = work
     upright = read_clip(folder, images)
     clip, body = rolled(upright, degrees), load_body('human37')
@@ -135,8 +135,8 @@ def measure(
     """Errors by clip, stage and gravity, at each of `ANGLES`.
 
     Args:
-        clips: folder of the clips; None: the development clips.
-        names: of the clips; those that are not there are left out.
+        clips: folder of the clips; None means the development clips.
+        names: names of the clips; missing ones are left out.
         stages: some of `STAGES`.
         gravities: some of `GRAVITIES`.
         quick: a few images of the first clip, lifted.
@@ -168,7 +168,7 @@ def measure(
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """The errors as a table, mm, and what the worst angle costs."""
+    """Table of the errors, mm, and of the increase at the worst angle, %."""
     rows = [['mm', 'clip', *(f'{a} degrees' for a in ANGLES), 'at worst, %']]
     for one in result['rows']:
         upright, *others = (one['mm'][str(a)] for a in ANGLES)

@@ -1,9 +1,9 @@
-"""Runs of the tracker over clips: each in a process of its own, remembered until the code changes.
+"""Runs of the tracker over clips, in parallel processes and cached until the code changes.
 
-A run is a clip, what the tracker is given of it, a seed and changed settings. What it found is kept
-as arrays in `build/benchmarks/tracking`, under a name that depends on the run, the code and the
-clip: a benchmark that was broken off goes on where it was. A small JSON file beside each record
-tells which run it is, so that the records of another checkout can be compared (`records_of`).
+A run is defined by a clip, inputs, a seed and changed settings. Its results are stored as arrays in
+`build/benchmarks/tracking`, under a name that depends on the run, the code and the clip, so that an
+interrupted benchmark continues where it stopped. A small JSON file next to each record identifies
+the run, so that records of another checkout can be compared (`records_of`).
 """
 
 from __future__ import annotations
@@ -65,15 +65,15 @@ STARTS = (SUBJECT, KEYPOINTS)
 UNKNOWN, GIVEN = 'unknown', 'given'
 GRAVITIES = (UNKNOWN, GIVEN)
 KEPT = ROOT / 'build' / 'benchmarks' / 'tracking'
-# Joints of a record: the origin, then those that are scored.
+# Joints of a record: the origin, then the scored joints.
 JOINTS = (ORIGIN, *EVALUATED_JOINTS)
-# Images a second of most clips.
+# Frame rate of most clips, Hz.
 USUAL_RATE = 30.0
-# Images after which everything is loaded.
+# Number of images for the warm-up.
 WARMING = 2
-# Images after which the modes of an image are weighed by what became of them.
+# Number of later images that determine the lagged weights of the modes.
 LAG = 10
-# Streams of random numbers of a seed.
+# Identifier of a random stream.
 OF_BLIND_CONTROL = 5
 
 
@@ -82,14 +82,14 @@ class Run:
     """One run.
 
     Attributes:
-        folder: of the clip.
-        inputs: what the tracker is given, one of `INPUTS`.
-        seed: of the tracker.
-        changes: settings of the tracker, by their path, that differ from the defaults.
-        limit: number of images of the clip, of which `rate` may leave out some; None: all.
-        start: what the track starts from, one of `STARTS`.
-        rate: images a second that the tracker is given at most; 0: all images of the clip.
-        gravity: whether the tracker is given its direction with each image, one of `GRAVITIES`.
+        folder: folder of the clip.
+        inputs: inputs of the tracker, one of `INPUTS`.
+        seed: seed of the tracker.
+        changes: settings of the tracker that differ from the defaults, as path and value.
+        limit: maximum number of images, before `rate` leaves some out; None means all.
+        start: source of the initial pose, one of `STARTS`.
+        rate: maximum number of images per second; 0 means all images of the clip.
+        gravity: whether the direction of gravity is given with each image, one of `GRAVITIES`.
     """
 
     folder: Path
@@ -108,39 +108,38 @@ class Run:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What tells it from other runs, whatever the code and wherever the clip is; for JSON."""
+        """Identity of the run, independent of the code and the clip's folder, for JSON."""
         changes = [[name, value] for name, value in sorted(self.changes, key=lambda x: x[0])]
         return {**asdict(self), 'folder': None, 'clip': self.clip, 'changes': changes}
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """What a run found, and the truth: T images that had a posterior, K modes, J joints.
+    """Results of a run, and the truth, for T images with a posterior, K modes and J joints.
 
     Attributes:
-        stamps: (T,) ns.
-        joints: (T, K, J, 3) of the modes, m, camera frame; NaN where there are fewer.
-        weights: (T, K); 0 where there are fewer.
-        point: (T, J, 3) of the point estimate, m.
-        blind: (T,) least error of the heaviest mode and draws around it, as many as modes, m.
-        levels: (T,) of the true positions of all joints together.
-        joint_levels: (T, J) of each scored joint alone.
-        log_densities: (T,) of the true positions.
-        evaluations: (T,) of the likelihood.
-        seconds: (T,) a step took.
+        stamps: (T,) timestamps, ns.
+        joints: (T, K, J, 3) positions in each mode, m, camera frame; NaN for missing modes.
+        weights: (T, K) weights of the modes; 0 for missing modes.
+        point: (T, J, 3) positions in the point estimate, m.
+        blind: (T,) minimum error over the heaviest mode and draws from it, K in total, m.
+        levels: (T,) probability levels of the true positions of all joints together.
+        joint_levels: (T, J) probability levels of the true position of each scored joint.
+        log_densities: (T,) log densities of the true positions.
+        evaluations: (T,) number of likelihood evaluations.
+        seconds: (T,) duration of each step, s.
         images: (1,) number of images of the run.
-        true: (T, J, 3) m, camera frame; NaN where a joint has no truth.
-        contact: (T, 2) whether the left and the right foot have stood since the image before;
-            empty: unknown.
-        views: (T, 3, 4) rotation and position of the camera in the world; the world is the camera's
-            frame where the clip does not tell.
-        cpu_seconds: (T,) of processor time that a step took, all threads together; empty: unknown.
-        statuses: (N,) what the tracker was doing in each image of the run, the value of its status;
-            empty: unknown.
-        lagged: (T, K) weights by what became of the modes in the next `LAG` images; empty: unknown.
-        absolute_levels: (T, J) of the true position of each scored joint in the frame of the
-            camera; empty: unknown.
-        volumes: (T, J) of the regions of 90 % there, m^3; empty: unknown.
+        true: (T, J, 3) true positions, m, camera frame; NaN for a joint without truth.
+        contact: (T, 2) whether the left and the right foot have stood since the previous image;
+            empty if unknown.
+        views: (T, 3, 4) rotation and position of the camera in the world; identity if the clip
+            has no camera motion.
+        cpu_seconds: (T,) processor time of each step, summed over threads, s; empty if unknown.
+        statuses: (N,) status of the tracker in each image of the run; empty if unknown.
+        lagged: (T, K) weights of the modes given the next `LAG` images; empty if unknown.
+        absolute_levels: (T, J) probability levels of each scored joint's true position in the
+            camera frame; empty if unknown.
+        volumes: (T, J) volumes of the 90 % regions in the camera frame, m^3; empty if unknown.
     """
 
     stamps: NDArray[np.int64]
@@ -165,7 +164,7 @@ class Record:
 
 
 def keypoints_only(settings: TrackerSettings) -> TrackerSettings:
-    """The same tracker with the terms of the image off."""
+    """The settings with all image terms switched off."""
     off: dict[str, Any] = {term.name: OFF for term in TERMS}
     likelihood = replace(settings.likelihood, **off)
     return replace(settings, likelihood=likelihood, flow_weight=0.0)
@@ -174,7 +173,7 @@ def keypoints_only(settings: TrackerSettings) -> TrackerSettings:
 def new_tracker(
     clip: Clip, body: Body, settings: TrackerSettings, seed: int, *, with_subject: bool = True
 ) -> Tracker:
-    """A tracker that starts with the subject of a clip, or with whom its inputs show."""
+    """A tracker that starts from the subject file of a clip, or from its inputs."""
     background = None if clip.background is None else BackgroundModel.from_image(clip.background)
     tracker = Tracker(body, clip.camera, settings, background, seed)
     if with_subject:
@@ -190,10 +189,10 @@ def begun(
     *,
     with_subject: bool = True,
 ) -> tuple[Tracker, dict[int, Keypoints]]:
-    """A tracker for one of `INPUTS`, and the keypoints that it is given by stamp.
+    """A tracker for one of `INPUTS`, and its keypoints by timestamp.
 
     Raises:
-        ValueError: the clip has no keypoints, and the tracker needs them.
+        ValueError: the tracker needs keypoints, but the clip has none.
     """
     settings = settings or TrackerSettings()
     if inputs == KEYPOINTS:
@@ -204,7 +203,7 @@ def begun(
 
 
 class Step(NamedTuple):
-    """What the tracker says of an image, and the time and the processor time that it took, s."""
+    """Result of the tracker for an image, with wall time and processor time, s."""
 
     stamp: int
     posterior: GaussianMixture | None
@@ -216,13 +215,13 @@ class Step(NamedTuple):
 def stepped(
     clip: Clip, tracker: Tracker, keypoints: Mapping[int, Keypoints], *, gravity: str = UNKNOWN
 ) -> Iterator[Step]:
-    """The images of a clip through a tracker; it may be asked for more after each.
+    """Runs a tracker over the images of a clip, and yields a result after each.
 
     Args:
-        clip: images, and the views of a camera that moves.
-        tracker: before the first image.
-        keypoints: by stamp.
-        gravity: one of `GRAVITIES`; images of which the clip does not tell it go without.
+        clip: clip with images, and views if the camera moves.
+        tracker: tracker before its first image.
+        keypoints: keypoints by timestamp.
+        gravity: one of `GRAVITIES`; images without known gravity get none.
     """
     for stamp, image in zip(clip.stamps, clip.images, strict=True):
         start, cpu_start = time.perf_counter(), time.process_time()
@@ -236,7 +235,7 @@ def stepped(
 
 
 class Seen(NamedTuple):
-    """What the tracker says of an image in which it sees somebody."""
+    """Result of the tracker for an image with a tracked person."""
 
     stamp: int
     body: Body
@@ -246,7 +245,7 @@ class Seen(NamedTuple):
 
 
 def tracked(clip: Clip, inputs: str, gravity: str, seed: int = 0) -> list[Seen]:
-    """What the tracker says of the images of a clip; the arguments are as of a `Run`."""
+    """Results of the tracker for the images of a clip; arguments as for `Run`."""
     tracker, keypoints = begun(clip, inputs, seed)
     return [
         Seen(
@@ -282,14 +281,14 @@ def follow(
     *,
     gravity: str = UNKNOWN,
 ) -> Record:
-    """What a tracker says of the images of a clip, beside the truth.
+    """Results of a tracker for the images of a clip, with the truth.
 
     Args:
         clip, tracker, keypoints, gravity: as for `stepped`.
-        seed: of the draws of the blind control and of the regions.
+        seed: seed of the blind control and of the regions.
 
     Raises:
-        ValueError: gravity is to be given, and the clip does not tell it.
+        ValueError: gravity is to be given, but the clip does not contain it.
     """
     if gravity == GIVEN and not clip.ups:
         raise ValueError(f'{clip.folder}: truth.npz has neither gravity nor up')
@@ -340,7 +339,7 @@ def recorded(
 ) -> Record:
     """Mixtures and point estimates (T,) with their scores against the truth of a clip.
 
-    T may be 0: nobody was found in any image. What they cost is unknown.
+    T is 0 if nobody was found in any image. Times and numbers of evaluations are set to 0.
     """
     origin = origin_joints(clip.truth.joint_names)
     scored = clip.truth.evaluated_joints()
@@ -373,7 +372,7 @@ def recorded(
         return record
     rng = np.random.default_rng([seed, OF_BLIND_CONTROL])
     found, absolute = [], []
-    # The body changes only while its flesh is fitted: its kinematics is computed in batches.
+    # The body changes only while its flesh is fitted, so kinematics are computed in batches.
     first = 0
     for i in range(1, len(bodies) + 1):
         if i == len(bodies) or bodies[i] is not bodies[first]:
@@ -407,7 +406,7 @@ def recorded(
 
 
 def true_joints(clip: Clip, stamps: Sequence[int]) -> NDArray[np.float64]:
-    """True positions (T, J, 3) of `JOINTS`; NaN where a joint has no truth."""
+    """True positions (T, J, 3) of `JOINTS`; NaN for a joint without truth."""
     names = clip.truth.joint_names
     every = np.array([clip.truth.joints[stamp] for stamp in stamps])
     every = every.reshape(-1, len(names), 3)
@@ -420,7 +419,7 @@ def true_joints(clip: Clip, stamps: Sequence[int]) -> NDArray[np.float64]:
 
 
 def joints_of(body: Body, poses: NDArray[np.float64], clip: Clip) -> NDArray[np.float64]:
-    """Positions (N, J, 3) of `JOINTS`; the first is the origin that the truth of a clip has."""
+    """Positions (N, J, 3) of `JOINTS`; the first is the origin as defined by the clip's truth."""
     every = body.joint_positions(poses)
     result: NDArray[np.float64] = every[:, body.skeleton.joint_index([*JOINTS])]
     centre = body.skeleton.joint_index([*origin_joints(clip.truth.joint_names)])
@@ -436,7 +435,7 @@ def feet_and_views(clip: Clip, stamps: list[int]) -> tuple[NDArray[np.bool_], ND
         rows = [row[stamp] for stamp in stamps]
         if 'contact' in content:
             stands = content['contact'].astype(np.bool_)
-            # Images may have been left out: a foot stands that did in all of them.
+            # A foot stands if it stood in all images since the previous used one.
             before = [*rows[:1], *rows[:-1]]
             since = [stands[a : b + 1].all(0) for a, b in zip(before, rows, strict=True)]
             contact = np.array(since, dtype=np.bool_).reshape(-1, 2)
@@ -450,11 +449,11 @@ def feet_and_views(clip: Clip, stamps: list[int]) -> tuple[NDArray[np.bool_], ND
 
 
 def run_all(runs: Sequence[Run], processes: int = 0, kept: Path = KEPT) -> list[Record]:
-    """Records of many runs, in parallel; those that are kept are read.
+    """Records of many runs, computed in parallel or read from the cache.
 
     Args:
-        runs: to do.
-        processes: number of processes, one thread each; 0: one a core; 1: this one.
+        runs: wanted runs.
+        processes: number of processes with one thread each; 0 means one per core, 1 this process.
         kept: folder of the records.
     """
     kept.mkdir(parents=True, exist_ok=True)
@@ -477,15 +476,15 @@ def run_all(runs: Sequence[Run], processes: int = 0, kept: Path = KEPT) -> list[
 def in_processes(
     work: Callable[[Item], Result], items: Sequence[Item], processes: int, what: str
 ) -> list[Result]:
-    """What work makes of items, each in a process of one thread; a bar shows progress.
+    """Applies a function to items in processes of one thread each, with a progress bar.
 
-    The first error ends it: items whose work has not begun are left.
+    The first error stops it; items not yet begun are cancelled.
 
     Args:
-        work: function of a module.
-        items: that can be pickled.
-        processes: number of processes; 0: one a core; 1: this one.
-        what: is done, for the bar.
+        work: function defined in a module.
+        items: picklable arguments.
+        processes: number of processes; 0 means one per core, 1 this process.
+        what: label of the progress bar.
     """
     if processes == 1 or not items:
         return [work(item) for item in items]
@@ -526,21 +525,21 @@ def _run_and_keep(item: tuple[Run, Path]) -> None:
         np.savez_compressed(file, **{x.name: getattr(record, x.name) for x in fields(record)})
 
 
-# Filled once this process has run a tracker.
+# Not empty once this process has run a tracker.
 _warm: list[bool] = []
 
 
 def _warm_up(one: Run) -> None:
-    """Runs a few images, once in a process: the first ones also load, which is not counted."""
+    """Runs a few images once per process, so that loading does not count in the times."""
     if not _warm:
         run(replace(one, limit=WARMING, rate=0.0))
         _warm.append(True)
 
 
 def read_record(path: Path) -> Record | None:
-    """A record that was kept; None if it is missing or damaged.
+    """Reads a stored record; None if it is missing or damaged.
 
-    What records of an older checkout lack is unknown, where it may be.
+    Fields with defaults may be missing in records of older checkouts.
     """
     try:
         with np.load(path) as content:
@@ -553,14 +552,14 @@ def read_record(path: Path) -> Record | None:
 
 
 def records_of(runs: Sequence[Run], folder: Path) -> list[Record | None]:
-    """The newest record of each run in a folder of records, whatever code it is of.
+    """The newest record of each run in a folder of records, of any version of the code.
 
     Args:
-        runs: wanted.
-        folder: of the records of another checkout; None in the result: it has no such record.
+        runs: wanted runs.
+        folder: records of another checkout; the result is None for runs without a record.
 
     Raises:
-        ValueError: the folder holds no records.
+        ValueError: the folder contains no records.
     """
     index: dict[str, list[Path]] = {}
     for path in sorted(folder.glob('*.json'), key=lambda path: -path.stat().st_mtime_ns):
@@ -577,10 +576,10 @@ def records_of(runs: Sequence[Run], folder: Path) -> list[Record | None]:
 
 
 def _normalised(text: str) -> str:
-    """The same text for the same identity of a run; empty: the text is damaged.
+    """Canonical text of the identity of a run; empty if the text is damaged.
 
-    What a file of an older checkout does not state has its usual value; its runs over smaller
-    images are left out.
+    Entries missing in files of older checkouts get their defaults; runs of older checkouts over
+    smaller images are left out.
     """
     usual = {x.name: x.default for x in fields(Run) if x.default is not MISSING}
     try:
@@ -593,7 +592,7 @@ def _normalised(text: str) -> str:
 
 
 def name_of(one: Run) -> str:
-    """Name of the record of a run: another for other code, another clip or other settings."""
+    """Name of the record of a run, which depends on code, clip and settings."""
     files = [path for path in sorted(one.folder.iterdir()) if path.is_file()]
     seen = [(path.name, path.stat().st_size) for path in files]
     text = repr((code_digest(), seen, {**asdict(one), 'folder': one.clip}))
@@ -603,7 +602,7 @@ def name_of(one: Run) -> str:
 
 @lru_cache(maxsize=1)
 def code_digest() -> str:
-    """Of the code and data that a record depends on."""
+    """Hash of the code and data on which a record depends."""
     digest = hashlib.sha256()
     layers = ('body', 'core', 'evaluation', 'experts', 'flips', 'image', 'inference', 'tracking')
     for path in sorted(
@@ -628,10 +627,10 @@ def _length(one: Run) -> int:
 
 
 def changed(changes: Sequence[tuple[str, Any]]) -> TrackerSettings:
-    """Settings with those that are named by their path, such as `likelihood.edges.weight`.
+    """Default settings with changes, named by paths such as `likelihood.edges.weight`.
 
     Raises:
-        ValueError: the setting does not exist, or does not take the value.
+        ValueError: a setting does not exist or has another type.
     """
     settings: Any = TrackerSettings()
     for path, value in changes:
@@ -658,7 +657,7 @@ def parsed_changes(words: Sequence[str]) -> tuple[tuple[str, Any], ...]:
     """Changes from words such as `max_hypotheses=4`.
 
     Raises:
-        ValueError: a word of another form, or no such setting.
+        ValueError: a word has another form, or its setting does not exist.
     """
     result = []
     for word in words:

@@ -1,4 +1,4 @@
-"""The nodes of `person_node`, sampled: see `benchmarks.sampling`."""
+"""The nodes of `person_node` with a sampling profiler, see `benchmarks.sampling`."""
 
 from __future__ import annotations
 

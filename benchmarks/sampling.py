@@ -1,8 +1,8 @@
 """CPU time by call stack: samples of all threads of a process.
 
-A sample of a thread is worth the CPU time that it has spent since the one before. What a node does
-is known by its session, a stage of a step by the functions of `benchmarks.stages`; the time of a
-library counts for the function of the project that calls it.
+A sample of a thread has the CPU time that the thread has used since the previous one. Time is
+assigned to a node by its session, to a stage of a step by the functions of `benchmarks.stages`, and
+for libraries to the calling function of the project.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from typing import Any, NamedTuple
 
 from benchmarks.clips import ROOT, table
 
-# Names the file that a sampled process writes at its end.
+# Environment variable with the file that a sampled process writes at its end.
 PROFILE_FILE = 'HMT_PROFILE_FILE'
-# Time between two samples, s: no divisor of the interval between two images.
+# Interval between two samples, s, which must not divide the interval between two images.
 PERIOD = 0.0043
 PACKAGES = tuple(f'{ROOT / name}{os.sep}' for name in ('hmt_ros', 'msg_tools', 'hmt_learning'))
 STEP = ('hmt_ros/tracking/tracker.py', 'step')
@@ -35,7 +35,7 @@ NODES = {
     'hmt_ros/sessions/keypoints_session.py': 'detector',
 }
 IN_STEPS, EXECUTOR, OTHER, REST = 'steps', 'executor of ROS', 'other threads', 'DDS, and unsampled'
-# Functions in a table.
+# Maximum number of functions in a table.
 TOLD = 25
 
 Function = tuple[str, str]  # file and name
@@ -45,10 +45,10 @@ class Sample(NamedTuple):
     """Time of a call stack, innermost function first.
 
     Attributes:
-        second: of the clock that does not jump.
-        thread: its name.
+        second: time of the monotonic clock, whole seconds.
+        thread: name of the thread.
         stack: functions of the project.
-        seconds: of CPU.
+        seconds: CPU time, s.
     """
 
     second: int
@@ -93,7 +93,7 @@ class StackSampler(AbstractContextManager['StackSampler']):
                         self._found[second, thread.name, tuple(stack)] += spent
 
     def samples(self) -> list[Sample]:
-        """What has been sampled."""
+        """The samples taken."""
         return [
             Sample(second, thread, _of_project(stack), spent)
             for (second, thread, stack), spent in self._found.items()
@@ -109,12 +109,12 @@ def _of_project(stack: Iterable[CodeType]) -> tuple[Function, ...]:
 
 
 def write_samples(samples: Iterable[Sample], file: Path) -> None:
-    """Writes what `read_samples` reads."""
+    """Writes a file for `read_samples`."""
     file.write_text(json.dumps(list(samples)), 'utf-8')
 
 
 def read_samples(file: Path) -> list[Sample]:
-    """Samples of a process that has ended."""
+    """Reads the samples of a process that has ended."""
     return [
         Sample(second, thread, tuple((name, function) for name, function in stack), spent)
         for second, thread, stack, spent in json.loads(file.read_text('utf-8'))
@@ -122,10 +122,10 @@ def read_samples(file: Path) -> list[Sample]:
 
 
 def profile_of(samples: Iterable[Sample], images: int, cpu_s: float | None = None) -> Any:
-    """CPU time an image by node, by stage of a step, and by function outside of steps, ms.
+    """CPU time per image by node, by stage of a step, and by function outside steps, ms.
 
     Args:
-        cpu_s: of the whole process; None: of the samples.
+        cpu_s: CPU time of the whole process, s; None means that of the samples.
     """
     stages = _stages()
     nodes, parts, functions = Counter[str](), Counter[str](), Counter[str]()
@@ -150,8 +150,8 @@ def profile_of(samples: Iterable[Sample], images: int, cpu_s: float | None = Non
 
 
 def _stages() -> Mapping[Function, str]:
-    """Stages of a step by the functions that they are."""
-    # Here, so that the nodes need no inner modules of the tracker.
+    """Stages of a step by their functions."""
+    # Imported here, so that the nodes need no inner modules of the tracker.
     from benchmarks.stages import STAGES
 
     codes = ((getattr(owner, name).__code__, stage) for owner, name, stage in STAGES)
@@ -159,7 +159,7 @@ def _stages() -> Mapping[Function, str]:
 
 
 def profiles_as_text(found: Mapping[str, Any], *, markdown: bool = False) -> str:
-    """Tables of profiles by what was profiled: nodes, stages, functions."""
+    """Tables of profiles: nodes, stages, functions."""
     tables = []
     for part, what in (
         ('nodes', 'CPU, ms an image'),

@@ -1,9 +1,9 @@
-"""smoothing: what the smoother of the node makes of clips with known truth, live and offline.
+"""smoothing: accuracy of the node's smoother on clips with known truth, live and offline.
 
-The tracker follows every clip with images, with keypoints as well, and with keypoints alone,
-gravity given where the clip tells it, at the rate of the clip and at lower ones. What it says of
-each image goes through a `SmootherSession` with the defaults of the node, live, and through its
-smoother once, over the whole clip. The filter stands beside both, scored at the same images.
+The tracker follows every clip with images, with images and keypoints, and with keypoints alone, at
+the rate of the clip and at lower ones; gravity is given if the clip contains it. Its results go
+through a `SmootherSession` with the defaults of the node (live), and once through its smoother over
+the whole clip (offline). The filter is scored at the same images.
 """
 
 from __future__ import annotations
@@ -60,12 +60,11 @@ from msg_tools.messages.pose_mixtures import (
 Array = NDArray[np.float64]
 
 FILTER, LIVE, OFFLINE = WAYS = 'filter', 'live', 'offline'
-# Images a second; 0: all of a clip.
+# Images per second; 0 means all images of a clip.
 RATES = (0.0, 8.0, 3.0)
-# Mixtures that are kept for smoothing over the whole clip.
+# Length of the smoothing window, in mixtures, for a whole clip.
 KEPT = 10_000
-# Distance of the joints of two modes, in the mean, from which on they are counted apart, m, and the
-# weight that a mode must have.
+# Minimum mean distance of the joints of distinct modes, m, and minimum weight of a counted mode.
 APART, LIKELY = 0.03, 0.01
 TOGETHER = 'Both'
 GROUP_ORDER = (OF_CHOSEN, OF_OTHERS, TOGETHER, OF_APART)
@@ -82,15 +81,15 @@ MOTION = (
     Column('root, %', 'root_percent', '.1f'),
     Column('log(K w)', 'weights', '.2f'),
 )
-# Of `scores_of`.
+# Keys of `scores_of`.
 SCORES = tuple(x.key for x in (ERROR, BEST, *MOTION))
-PERCENT = 'percent'  # of the filter's error
+PERCENT = 'percent'  # difference from the filter's error, %
 SMOOTHED = 'smoothed_pose_mixture'
-QUICK = 12  # images
+QUICK = 12  # number of images with --quick
 
 
 class Work(NamedTuple):
-    """A clip, and how it is seen: see `Run`; `limit` images at most, None: all."""
+    """A clip and its conditions, see `Run`; `limit` is the maximum number of images or None."""
 
     folder: Path
     inputs: str
@@ -135,15 +134,15 @@ def measure(
     """Scores by clip, and their means over groups of clips.
 
     Args:
-        clips: folder of the clips; None: the development clips, or bags/.
-        names: of some of them; empty: all.
+        clips: folder of the clips; None means the development clips, or bags/.
+        names: names of the clips to use; empty means all.
         inputs: some of `runs.INPUTS`.
-        rates: images a second at most; 0: all images.
-        seeds: number of seeds of the tracker where all images are taken; one at lower rates.
+        rates: maximum numbers of images per second; 0 means all images.
+        seeds: number of seeds of the tracker for all images; lower rates have one seed.
         quick: a few images of one clip.
 
     Raises:
-        ValueError: there are no such clips, or one can not be read.
+        ValueError: there are no such clips, or a clip can not be read.
     """
     folders, source = find_clips(clips, moving=True, quick=quick)
     if names:
@@ -177,8 +176,8 @@ def measure(
 def of_clip(work: Work) -> dict[str, float]:
     """Scores of one clip, `filter heaviest_mm` and so on.
 
-    Of the smoother also the difference of each from the filter, `live heaviest_mm change`, and of
-    its errors in % of the filter's, `live percent`.
+    For the smoother also the difference of each score from the filter's, `live heaviest_mm change`,
+    and that of its errors in % of the filter's, `live percent`.
     """
     clip = at_rate(read_clip(work.folder, work.limit), work.rate)
     seen = tracked(clip, work.inputs, GIVEN, work.seed)
@@ -197,7 +196,7 @@ def of_clip(work: Work) -> dict[str, float]:
 
 
 def _scores(record: Record) -> dict[str, float]:
-    """Of the tables, besides processor time."""
+    """Scores of a record for the tables, without processor time."""
     scores = scores_of(record)
     joints = record.joint_levels.shape[1]
     return {
@@ -208,7 +207,7 @@ def _scores(record: Record) -> dict[str, float]:
 
 
 def modes_apart(record: Record) -> float:
-    """How many likely modes of an image are apart by `APART`, in the mean over images."""
+    """Mean number of likely modes of an image that differ by `APART`."""
     relative = record.joints - record.joints[:, :, :1]
     counts = []
     for joints, weights in zip(relative, record.weights, strict=True):
@@ -221,14 +220,14 @@ def modes_apart(record: Record) -> float:
 def smoothed(
     seen: Sequence[Seen], views: Mapping[int, tuple[Array, Array]] = MappingProxyType({})
 ) -> tuple[dict[str, dict[int, GaussianMixture]], float]:
-    """What the node publishes, and what it makes of all images together, by way and stamp.
+    """Mixtures that the node publishes, and those smoothed over all images, by way and timestamp.
 
-    Also the mean processor time that the node takes over an image, ms.
+    Also returns the mean processor time of the node per image, ms.
 
     Args:
-        seen: of the images.
-        views: stamp -> rotation (3, 3) and position (3,) of a camera that moves, in the world;
-            its node is given likelihoods in the frame of the world, as `fixed_frame` has them.
+        seen: results of the tracker for the images.
+        views: timestamp -> rotation (3, 3) and position (3,) in the world of a moving camera; the
+            node then gets likelihoods in the world frame, as with `fixed_frame`.
     """
     frames: dict[int, FixedFrame] = {}
     turn = 0.0
@@ -292,7 +291,7 @@ def smoothed(
 
 
 def _seen_again(mixture: GaussianMixture, body: Body, frame: FixedFrame | None) -> GaussianMixture:
-    """A mixture in the frame of the camera again."""
+    """A mixture transformed back to the camera frame."""
     if frame is None:
         return mixture
     back = CameraMotion(
@@ -304,7 +303,7 @@ def _seen_again(mixture: GaussianMixture, body: Body, frame: FixedFrame | None) 
 
 
 def record_of(clip: Clip, seen: Sequence[Seen], mixtures: dict[int, GaussianMixture]) -> Record:
-    """Mixtures by stamp, with the truth; their point estimate is the heaviest mode."""
+    """Record of mixtures by timestamp; their point estimate is the heaviest mode."""
     rows = [x for x in seen if x.stamp in clip.truth.joints]
     found = [mixtures[x.stamp] for x in rows]
     points = [one.means[one.weights.argmax()] for one in found]
@@ -312,7 +311,7 @@ def record_of(clip: Clip, seen: Sequence[Seen], mixtures: dict[int, GaussianMixt
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """Tables for people."""
+    """Human-readable tables."""
     ends = 'the 95 % interval over clips and seeds'
     parts = (
         f'Errors of the heaviest component, mm, and the mean over clips of what they differ from '
@@ -336,7 +335,7 @@ def _of(way: str, column: Column) -> Column:
 
 
 def _cell(column: Column, entry: dict[str, Any]) -> str:
-    """Of a clip or, with an interval where it is a difference, of means over clips."""
+    """Text of a score of a clip or of means over clips; differences have an interval."""
     value = entry.get(column.key)
     if not isinstance(value, tuple):
         return column.cell(value)
@@ -362,7 +361,7 @@ def error_rows(result: dict[str, Any]) -> list[list[str]]:
 
 
 def density_rows(result: dict[str, Any]) -> list[list[str]]:
-    """Densities and components by clip and way, and means over the clips that have means."""
+    """Densities and components by clip and way, with means over clips."""
     columns = [_of(way, DENSITY) for way in WAYS]
     columns += [
         Column(f'{way} - filter', f'{way} {DENSITY.key} change', '+.2f') for way in (LIVE, OFFLINE)
@@ -382,7 +381,7 @@ def density_rows(result: dict[str, Any]) -> list[list[str]]:
 
 
 def motion_rows(result: dict[str, Any]) -> list[list[str]]:
-    """What filter and smoother are besides, means over groups of clips."""
+    """Further scores of filter and smoother, means over groups of clips."""
     columns = (*MOTION, CPU)
     rows = [['inputs', '', *(x.head for x in columns)]]
     for group, means in result['means'].items():

@@ -1,4 +1,4 @@
-"""Where time goes: a clock around parts, from outside; and the parts of a tracking step."""
+"""A clock for parts of a program, wrapped from outside, and the stages of a tracking step."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hmt_ros.tracking.filter import MixtureFilter
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.proposals import kinematic_jumps as jumps_module
 
-# Part of the tracker -> name of the stage; time in a part that another part calls is its own.
+# Owner, name and stage of each part; time in a nested part counts only for that part.
 Stages = Sequence[tuple[Any, str, str]]
 STAGES: Stages = (
     (BackgroundModel, 'split', 'background'),
@@ -32,7 +32,7 @@ STAGES: Stages = (
     (MixtureFilter, '_fit_shape', 'shape'),
     (tracker_module, 'likelihood_modes', 'likelihood modes'),
 )
-# In these, minimisation and rating are part of the stage.
+# Stages that include their minimisation and rating.
 WHOLE = ('motion', 'start of the track', 'chain search')
 PROPOSED = ('proposals',)
 
@@ -41,8 +41,8 @@ class StageClock:
     """Seconds per stage, summed up.
 
     Args:
-        stages: owner of a part, its name there, and the stage that it is.
-        clock: that is read, s.
+        stages: owner, attribute name and stage of each part.
+        clock: function that returns the time, s.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class StageClock:
         self._proposed = False
 
     def begin_step(self) -> None:
-        """A new image: minimisation before proposals is that of the predictions."""
+        """Begins a new image; minimisation before its proposals belongs to the predictions."""
         self._proposed = False
 
     def _enter(self, stage: str) -> None:
@@ -91,7 +91,7 @@ class StageClock:
 
     @contextmanager
     def running(self) -> Iterator[StageClock]:
-        """Time all calls of the parts while it runs."""
+        """Times all calls of the parts in this context."""
         usual = [(owner, name, getattr(owner, name)) for owner, name, _ in self._stages]
         try:
             for (owner, name, stage), (_, _, function) in zip(self._stages, usual, strict=True):

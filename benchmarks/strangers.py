@@ -1,9 +1,9 @@
-"""strangers: files of other programs, each as its command takes it, against the plain command.
+"""strangers: commands with files of other programs, compared with plain files.
 
-The development data has small inputs after public bug reports of other projects (`cases`), cut from
-a clip with truth. A case is met if the heaviest mode errs by at most a tenth more than with a plain
-file of the same points, or if one line says what to do. The error is that of 13 joints from the
-pelvis, over images whose stamps the truth has.
+The development data has small inputs modelled on public bug reports of other projects (`cases`),
+cut from a clip with truth. A case is met if the error of the heaviest mode is at most a tenth above
+that with a plain file of the same points, or if one line says what to do. The error is that of 13
+joints relative to the pelvis, over images whose timestamps are in the truth.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ class Case(NamedTuple):
     """A command on a file of a case; `{}` is the folder of the case.
 
     Attributes:
-        name: of the case.
-        program: that takes it.
-        arguments: of the program, but for -o.
-        images: of the plain command that it is compared with; 0: it is enough that it ends well.
+        name: name of the case.
+        program: module of the command.
+        arguments: arguments of the command, without -o.
+        images: number of images of the plain command for comparison; 0 if success is enough.
         turned: whether the camera hangs upside down.
     """
 
@@ -103,7 +103,7 @@ def heaviest_of(bag: Path, clip: Path, *, turned: bool = False) -> float:
 
 
 def plain_of(chosen: Sequence[Case], cases: Path, folder: Path) -> dict[int, float]:
-    """Errors of the plain commands on the clip, mm, by their number of images."""
+    """Errors of the plain commands on the clip, mm, by number of images."""
     clip, found = cases.parent / 'video' / CLIP, {}
     keypoints = dict(np.load(clip / 'keypoints_mediapipe.npz'))
     for images in sorted({case.images for case in chosen if case.images and case.program is lift}):
@@ -120,10 +120,10 @@ def plain_of(chosen: Sequence[Case], cases: Path, folder: Path) -> dict[int, flo
 
 
 def measure(*, quick: bool = False) -> dict[str, Any]:
-    """What the commands make of the cases.
+    """Results of the commands for all cases.
 
     Raises:
-        FileNotFoundError: the development data is not there.
+        FileNotFoundError: the development data are missing.
     """
     cases = development_folder().parent / 'cases'
     if not cases.is_dir():
@@ -138,7 +138,7 @@ def measure(*, quick: bool = False) -> dict[str, Any]:
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """A table for people."""
+    """Human-readable table."""
     rows = [['case', 'exit code', 'error, mm', 'plain, mm', 'last line']]
     for one in result['rows']:
         plain = result['plain_mm'].get(one['images'], np.nan)

@@ -1,16 +1,16 @@
 """symmetric: do two motions with one image and one prior both keep their weight?
 
-A person 60 m from a camera with a lens of 9,000 px, or 12 m from one of 1,800 px, moves a limb.
-Flips of that limb have the same image in every image. Of random poses and their flips one pair
-makes a case: the ends of the limb are far apart as long as it moves, and where both poses are
-fitted to the image of the one; the priors of both motions, and these fits, differ least. So both
-are motions of the model that is tracked, and neither is the better one. The tracker is given
-keypoints alone, whose noise lasts, and no experts. It starts from both poses, half each, or from
-its own start: the keypoints of the first images. Each of its modes counts for the motion whose limb
-is nearer. Shares are of the images in which there is a track.
+A person 60 m from a camera of focal length 9,000 px, or 12 m from one of 1,800 px, moves a limb.
+The flipped limb looks the same in every image. A case is a pair of a random pose and its flip: the
+ends of the two limbs stay far apart while they move, and after both poses are fitted to the image
+of the first; among such pairs, the priors of the two motions and these fits differ least. So both
+are motions of the tracked model, and neither is better. The tracker gets only keypoints, with
+correlated noise, and no experts. It starts from both poses with half the weight each, or by itself
+from the keypoints of the first images. Each mode is assigned to the motion whose limb is nearer.
+Shares are of the images with a track.
 
-Beside the filter stand its chain given the images of the next half second (`backward_weights`), and
-what a `SmootherSession` with the defaults of the node publishes of an image, as much later.
+The filter is compared with its chain given the images of the next half second
+(`backward_weights`), and with the delayed output of a `SmootherSession` with the node's defaults.
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.tracking import Tracker, TrackerSettings
 
 ENDS = {'right_arm': 'wrist', 'left_arm': 'wrist', 'left_leg': 'ankle', 'right_leg': 'ankle'}
-# Distances of the person, m; focal lengths in proportion make all images the same size.
+# Distances of the person, m; focal length per distance, px/m, so that all images have one size.
 DISTANCES, FOCAL_LENGTH = (60.0, 12.0), 150.0
 NOISES, SEEDS = (3.0, 6.0), 5  # px
-SAID = 3.0  # px that the detector says that it errs by
-RATE, LENGTH = 30.0, 40  # images a second, images
-LASTING = 0.2  # s that the noise of keypoints lasts
-# Random poses, those tried as motions, least distance of the ends of the limb, m, and of the start.
+SAID = 3.0  # standard deviation stated by the detector, px
+RATE, LENGTH = 30.0, 40  # images per second, number of images
+LASTING = 0.2  # correlation time of the keypoint noise, s
+# Numbers of random poses and of tried motions; minimum distance of limb ends, m; initial deviation.
 POSES, TRIED, APART, START_SIGMA = 4000, 100, 0.3, 0.05
-LIKELY = 0.05  # part of the energy of the prior that counts beside its difference
-BOTH = 0.05  # weight that each motion keeps
-# Weights of a motion that are even in the filter, and in what is published of them.
+LIKELY = 0.05  # weight of the prior energy, in addition to its difference
+BOTH = 0.05  # minimum weight of each motion
+# Range of weights of a motion that are even in the filter, and in the published output.
 EVEN, KEPT_EVEN = (0.4, 0.6), (0.25, 0.75)
 OWN, GIVEN = 'own start', 'both given'
 CHAIN = 'chain'
@@ -66,11 +66,11 @@ class Case:
 
     Attributes:
         limb: name of the chain that is flipped.
-        distance: of the person, m.
-        seed: of the motion, the noise and the tracker.
-        noise: of the keypoints, px.
+        distance: distance of the person, m.
+        seed: seed of the motion, the noise and the tracker.
+        noise: standard deviation of the keypoints, px.
         motions: (2, T, d) poses, the true motion and the flipped one.
-        prior: energy of the prior of the flipped motion, less that of the true one, nats an image.
+        prior: prior energy of the flipped motion minus that of the true one, nats per image.
     """
 
     limb: str
@@ -82,11 +82,11 @@ class Case:
 
     @property
     def camera(self) -> Camera:
-        """That sees the person."""
+        """Camera of the case."""
         return camera_at(self.distance)
 
     def keypoints(self) -> Iterator[Keypoints]:
-        """Of every image; the noise is AR(1)."""
+        """Keypoints of every image, with AR(1) noise."""
         rng, rho = np.random.default_rng(self.seed), np.exp(-1.0 / (RATE * LASTING))
         error = rng.normal(size=(len(JOINTS), 2))
         for joints in BODY.joint_positions(self.motions[0]):
@@ -116,7 +116,7 @@ def _keypoints(camera: Camera, joints: Array, error: Array | float = 0.0) -> Key
 
 
 def camera_at(distance: float) -> Camera:
-    """That shows a person at a distance, m, as large as at any other."""
+    """Camera that shows a person at this distance, m, at the usual size."""
     focal = FOCAL_LENGTH * distance
     return Camera(focal, focal, 319.5, 239.5, 640, 480)
 
@@ -170,7 +170,7 @@ def _motions(limb: str, distance: float, seed: int) -> tuple[Array, float]:
 
 
 def _moved(pose: Array, flip: Array, limb: str) -> Array | None:
-    """A motion (2, T, d) from a pose, and that from its flip; None: the flip leaves the limits."""
+    """Motions (2, T, d) from a pose and its flip; None if the flip leaves the limits."""
     own, times = BODY.skeleton.chain_dofs[limb], np.arange(LENGTH) / RATE
     path, other = np.tile(pose, (LENGTH, 1)), np.tile(flip, (LENGTH, 1))
     path[:, own] += 0.1 * np.sin(np.pi * times[:, None] + np.arange(len(own)))
@@ -191,11 +191,11 @@ def _moved(pose: Array, flip: Array, limb: str) -> Array | None:
 
 
 def tracked(case: Case, *, given: bool, **changes: Any) -> Iterator[Seen]:
-    """What the tracker says of the images of a case.
+    """Results of the tracker for the images of a case.
 
     Args:
-        case: it.
-        given: whether the tracker starts from both poses, half each.
+        case: case to track.
+        given: whether the tracker starts from both poses, with half the weight each.
         changes: settings of the tracker.
     """
     settings = replace(keypoints_only(TrackerSettings(lifter='')), **changes)
@@ -214,7 +214,7 @@ def tracked(case: Case, *, given: bool, **changes: Any) -> Iterator[Seen]:
 
 
 def given_later(seen: Sequence[Seen]) -> dict[int, GaussianMixture]:
-    """The filter's modes by stamp, weighed by its chain as late as the node publishes."""
+    """The filter's modes by timestamp, with chain weights at the delay of the smoother node."""
     lag = round(SmootherParameters().fixed_lag * RATE)
     result = {}
     for i, one in enumerate(seen):
@@ -238,7 +238,7 @@ def share(poses: GaussianMixture, case: Case, t: int) -> float:
 
 
 def of_case(case: Case, **changes: Any) -> list[dict[str, Any]]:
-    """Weights (T,) of the true motion by way, from either start; `changes` as of `tracked`."""
+    """Weights (T,) of the true motion by way, for both starts; `changes` as for `tracked`."""
     result = []
     for start, given in ((GIVEN, True), (OWN, False)):
         seen = list(tracked(case, given=given, **changes))
@@ -258,7 +258,7 @@ def of_case(case: Case, **changes: Any) -> list[dict[str, Any]]:
 
 
 def measure(*, quick: bool = False) -> dict[str, Any]:
-    """What `of_case` finds of all cases; of one where it must be quick."""
+    """Results of `of_case` for all cases, or for one if quick."""
     chosen = list(cases(['right_arm'], [0], DISTANCES[:1], NOISES[:1]) if quick else cases())
     found = in_processes(of_case, chosen, 1 if quick else 0, 'symmetric')
     return {'machine': description(), 'cases': [one for case in found for one in case]}

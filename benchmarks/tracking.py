@@ -1,8 +1,8 @@
 """tracking: accuracy, calibration and speed of the tracker on clips with known truth.
 
-The tracker is given the images, the images with the keypoints of a detector, or these keypoints
-alone. Clips on which its settings were chosen are told apart from the others. Runs are kept in
-build/benchmarks/tracking until the code changes: a benchmark that was broken off goes on.
+The tracker gets the images, the images with the keypoints of a detector, or these keypoints alone.
+Clips on which its settings were chosen are reported separately from the others. Runs are cached in
+build/benchmarks/tracking until the code changes, so an interrupted benchmark continues.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ from benchmarks.tracking_speed import PRICED, costs, speed
 from benchmarks.tracking_tables import COMPARED, HEAVIEST, as_text
 
 PARTS = ('accuracy', 'speed')
-ORACLES = 'oracles'  # a part of its own, of its own clips
+ORACLES = 'oracles'  # separate part, with its own clips
 SEEDS = (0, 1, 2)
 RATES = (USUAL_RATE,)
-TIMED = 'walk'  # if it is there
-QUICK = 10  # images
+TIMED = 'walk'  # clip for the speed, if available
+QUICK = 10  # number of images with --quick
 
 
 def main(argv: list[str]) -> int:
-    """Runs the benchmark; 1: there is nothing to run it on, or no such setting."""
+    """Runs the benchmark; returns 1 if there are no clips or a setting does not exist."""
     parser = benchmark_parser('tracking', __doc__, quick=f'{QUICK} images of one clip, one seed')
     parser.add_argument('--markdown', action='store_true', help='tables for a Markdown page')
     parser.add_argument(
@@ -158,24 +158,24 @@ def measure(
     baseline: Path | None = None,
     gravity: Sequence[str] = (UNKNOWN,),
 ) -> dict[str, Any]:
-    """Everything that was asked for.
+    """Runs the requested parts of the benchmark.
 
     Args:
-        clips: their folder; None: the development clips, or bags/.
-        only: names of some of them; empty: all.
+        clips: folder of the clips; None means the development clips, or bags/.
+        only: names of the clips to use; empty means all.
         inputs: some of `runs.INPUTS`.
-        seeds: of the tracker.
+        seeds: seeds of the tracker.
         parts: some of `PARTS`.
-        against: changed settings that the tracker is compared with; empty: no comparison.
-        processes: number of processes; 0: one a core.
+        against: changed settings to compare the tracker with; empty means no comparison.
+        processes: number of processes; 0 means one per core.
         quick: a few images of one clip, one seed.
-        start: what tracks start from, one of `runs.STARTS`; with images alone always the subject.
-        rates: images a second at most; `USUAL_RATE` or more: all images.
-        baseline: folder of the records of another checkout; None: no comparison.
-        gravity: some of `runs.GRAVITIES`; clips that do not tell it are only run without.
+        start: source of the initial pose, one of `runs.STARTS`; images alone use the subject.
+        rates: maximum numbers of images per second; `USUAL_RATE` or more means all images.
+        baseline: folder with the records of another checkout; None means no comparison.
+        gravity: some of `runs.GRAVITIES`; clips without gravity only run with it unknown.
 
     Raises:
-        ValueError: there is no such clip, or it can not be read.
+        ValueError: a clip does not exist or can not be read.
     """
     folders, source = find_clips(clips, moving=True, quick=quick)
     limit = None
@@ -251,7 +251,7 @@ def accuracy(runs: Sequence[Run], processes: int = 0) -> list[dict[str, Any]]:
 def comparison(
     runs: Sequence[Run], changes: tuple[tuple[str, Any], ...], processes: int = 0
 ) -> dict[str, Any]:
-    """What changed settings change on the same clips, inputs and seeds: their scores minus ours."""
+    """Scores with changed settings minus those with the usual ones, on the same runs."""
     others = [replace(one, changes=changes) for one in runs]
     scores = [scores_of(record) for record in run_all([*runs, *others], processes)]
     usual, own = scores[: len(runs)], scores[len(runs) :]
@@ -264,14 +264,14 @@ def comparison(
 def comparison_with_baseline(
     runs: Sequence[Run], folder: Path, processes: int = 0
 ) -> dict[str, Any]:
-    """Our scores minus those of the same runs of another checkout.
+    """Scores of this checkout minus those of another one, for the same runs.
 
-    Clips, inputs, rates and gravities of which the other checkout lacks a seed are left out.
+    Combinations of clip, input, rate and gravity that lack a seed in the other are left out.
 
     Args:
-        runs: to compare.
-        folder: of the records of the other checkout.
-        processes: number of processes; 0: one a core.
+        runs: runs to compare.
+        folder: folder with the records of the other checkout.
+        processes: number of processes; 0 means one per core.
 
     Raises:
         ValueError: the folder has no record of these runs.

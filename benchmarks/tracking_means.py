@@ -1,8 +1,8 @@
-"""Scores of runs put together: by clip, means over clips, and paired differences.
+"""Combined scores of runs: by clip, means over clips, and paired differences.
 
-An entry holds the scores of one clip, input, rate and knowledge of gravity, by seed, and their
-means over the seeds. The clips fall into groups: those that settings of the tracker were chosen on,
-the others, and those that are in no mean.
+An entry contains the scores of one clip, input, rate and knowledge of gravity, by seed, and their
+means over the seeds. Clips have three groups: those on which settings of the tracker were chosen,
+the others, and those excluded from means.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from benchmarks.runs import GRAVITIES, INPUTS, Run
 from benchmarks.tracking_scores import interval, interval_over_seeds
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS
 
-# Clips that settings of the tracker were chosen on.
+# Clips on which settings of the tracker were chosen.
 CHOSEN = ('walk', 'charleston', 'wander', 'shoot', 'signals', 'scoop', 'kick', 'follow')
-# Clips that are in no mean: this one plays four times too fast.
+# Clips excluded from means: this one plays four times too fast.
 APART = ('exercise',)
 OF_CHOSEN, OF_OTHERS, OF_APART = (
     'Clips that settings were chosen on', 'Other clips', 'Clips that are in no mean',
@@ -26,7 +26,7 @@ OF_CHOSEN, OF_OTHERS, OF_APART = (
 GROUPS = (OF_CHOSEN, OF_OTHERS, OF_APART)
 DETECTOR = 'MediaPipe 3D'
 BY_JOINT = 'by_joint_90'
-# What tells entries apart, besides the clip.
+# Keys that identify an entry, in addition to the clip.
 CONDITIONS = ('inputs', 'rate', 'gravity')
 Key = tuple[str, str, float, str]
 
@@ -52,7 +52,7 @@ def by_clip(runs: Iterable[Run], scores: Iterable[Any]) -> dict[Key, list[tuple[
 
 
 def entry_of(key: Key, scores: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Scores of a clip by seed, and their means; None: unknown."""
+    """Scores of a clip by seed, and their means; None if unknown."""
     clip, given, rate, gravity = key
     numbers = {
         name: [_known(one[name]) for one in scores] for name in scores[0] if name != BY_JOINT
@@ -73,7 +73,7 @@ def _known(value: float) -> float | None:
 
 
 def grouped(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Entries by `GROUPS`, with means over the clips of those that have some."""
+    """Entries by `GROUPS`, with means over the clips of groups that have means."""
     result = []
     for title in GROUPS:
         mine = [entry for entry in entries if group_of(entry['clip']) == title]
@@ -85,20 +85,20 @@ def grouped(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _rank(entry: dict[str, Any]) -> tuple[float, int, int]:
-    """All images come first, then falling rates; of a rate the inputs in their order."""
+    """Sort key: all images first, then decreasing rates; inputs in their order within a rate."""
     rate = entry['rate']
     given = (*INPUTS, DETECTOR).index(entry['inputs'])
     return -(rate if rate > 0 else np.inf), given, GRAVITIES.index(entry['gravity'])
 
 
 def by_input(entries: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
-    """Entries of the same rate, input and gravity together."""
+    """Entries grouped by rate, input and gravity."""
     ranks = sorted({_rank(entry) for entry in entries})
     return [[entry for entry in entries if _rank(entry) == rank] for rank in ranks]
 
 
 def means_of(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Means over the clips by rate, input and gravity, with both ends; see `interval`."""
+    """Means over the clips by rate, input and gravity, with intervals; see `interval`."""
     result = []
     for mine in by_input(entries):
         means: dict[str, Any] = {name: mine[0][name] for name in CONDITIONS}
@@ -129,9 +129,9 @@ def difference_entries(
     """Entries of paired differences.
 
     Args:
-        runs: that are compared; of a clip, input, rate and gravity as many seeds as of any other.
-        own, usual: their scores, and those that are subtracted.
-        names: of the scores.
+        runs: compared runs, with equal numbers of seeds for each clip, input, rate and gravity.
+        own, usual: scores of the runs, and the scores to subtract.
+        names: names of the scores.
     """
     differences = [
         {name: a[name] - b[name] for name in names} for a, b in zip(own, usual, strict=True)
@@ -146,14 +146,14 @@ def paired(entries: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]]
     """Paired differences of one score, by group, rate, input and gravity.
 
     Args:
-        entries: of differences.
-        name: of the score.
+        entries: entries of differences.
+        name: name of the score.
 
     Returns:
         By group, rate, input and gravity: `group`, `inputs`, `rate`, `gravity`, `clips` (their
         number), `difference` (mean, lower and upper end over clips and seeds), and the clips whose
         own interval over the seeds lies wholly `above` or `below` 0, see `interval_over_seeds`.
-        Clips that are in no mean have no difference.
+        Clips excluded from means have no difference.
     """
     result = []
     for title in GROUPS:

@@ -1,24 +1,24 @@
-"""Single oracles: what the tracker would gain if one thing were true, one at a time.
+"""Oracles: gain of the tracker if one of its inputs were exact, one at a time.
 
-true 2D landmarks      landmarks where the true ones are seen, all of them sure; on real clips the
-                       joints, and the face, that the truth has, the others as the detector says
-true 2D, weight 1 ...  the same, keypoints weighted more than the usual 0.5: if that helps, depth
-                       that an image tells was discounted, if not, keypoints do not tell it
-no constant 2D errors  the median error of each landmark over a clip, at the person, is taken out
+true 2D landmarks      exact projections of the true landmarks, with full confidence; on real clips
+                       of the joints and the face in the truth, other landmarks from the detector
+true 2D, weight 1 ...  the same with keypoints weighted more than the usual 0.5; if that helps, the
+                       depth information of an image was discounted, otherwise keypoints lack it
+no constant 2D errors  the median error of each landmark over a clip, at the person, is removed
 true depths            one pose with the true depths, instead of the mixture of the experts
-true depths, weight 1  the same, weighted ten times as much as experts are
-true lengths           those between the true joints
-true sides             keypoints of arms and legs that are called by the other side put right
-true heading           the heaviest of the modes that face the right way, at scoring
-experts, weight 0.3    the experts' depths weighted three times as much
-no experts, no depths  keypoints without the experts; without the detector's own 3D as well
+true depths, weight 1  the same with ten times the weight of the experts
+true lengths           lengths between the true joints
+true sides             keypoints of arms and legs with exchanged sides are corrected
+true heading           scores of the heaviest mode among those that face the right way
+experts, weight 0.3    the experts' depths with three times the weight
+no experts, no depths  keypoints without the experts; also without the detector's own 3D
 
-The floor is our body at the poses that come nearest to the truth: with its true lengths, and with
-those that a track begins with. It is what definitions of joints, and lengths, leave.
+The floor is the error of the body model at the poses nearest to the truth, with the true lengths
+and with the initial lengths of a track. It is due to definitions of joints, and to lengths.
 
-Errors are relative to the pelvis; where the truth has no pelvis, to the middle of the hips; where
-it has no hips, to the middle of the shoulders. They are split along the line of sight of each true
-joint and across it.
+Errors are relative to the pelvis; if the truth has no pelvis, to the middle of the hips; if it has
+no hips, to the middle of the shoulders. They are split into the components along and across the
+line of sight of each true joint.
 """
 
 from __future__ import annotations
@@ -72,10 +72,10 @@ REAL = (BEAM, *DESKS)
 OTHERS = ('dab', 'drill', 'laugh', 'orbit', 'traffic', 'turns', 'window')
 GROUPS = {'Real clips': REAL, 'Clips C': CHOSEN, 'Clips O': OTHERS}
 INPUTS = (BOTH, KEYPOINTS)
-QUICK = 6  # images
-# Headings from which the body is fitted to the truth.
+QUICK = 6  # number of images with --quick
+# Number of initial headings for the fit of the body to the truth.
 HEADINGS = 8
-# Deviation of true depths, and of true lengths, m.
+# Standard deviations of true depths and of true lengths, m.
 DEPTH_SIGMA, LENGTH_SIGMA = 0.03, 0.001
 ARM = ('shoulder', 'elbow', 'wrist', 'hand')
 LEG = ('hip', 'knee', 'ankle', 'toe')
@@ -83,17 +83,17 @@ LEG = ('hip', 'knee', 'ankle', 'toe')
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """What a tracker is given of a clip.
+    """Inputs of a tracker for a clip.
 
     Attributes:
-        clip: with its truth.
-        real: whether the truth is that of detectors, whose landmarks are its joints.
-        body: model of the person, as known before.
-        settings: of the tracker.
-        keypoints: by stamp.
-        fitted: body with the true lengths, and its poses (T, d) at the truth by stamp.
+        clip: clip with its truth.
+        real: whether the clip is real; joints of its truth are landmarks of detectors.
+        body: body model before any image of the person.
+        settings: settings of the tracker.
+        keypoints: detected keypoints by timestamp.
+        fitted: body with the true lengths, and its poses (d,) nearest to the truth by timestamp.
         lengths_known: whether the body's lengths are the person's.
-        depths: by stamp; they replace what experts and detector say.
+        depths: depths by timestamp, which replace those of experts and detector.
         depth_weight: factor on the energy of depths.
     """
 
@@ -109,7 +109,7 @@ class Given:
 
 
 class ToldTracker(Tracker):
-    """A tracker that takes given depths instead of the experts'."""
+    """A tracker that uses given depths instead of the experts'."""
 
     told: Mapping[int, LiftedPoses] | None = None
 
@@ -162,7 +162,7 @@ def _without_constant_errors(given: Given) -> Given:
 
 
 def _landmark_places(given: Given) -> dict[int, tuple[Array, Array]]:
-    """By stamp: true places (n, 3) of the landmarks, NaN: unknown, and their offsets (n, 3)."""
+    """True positions (n, 3) of landmarks, NaN if unknown, and offsets (n, 3), by timestamp."""
     body, poses = given.fitted
     names, result = given.clip.truth.joint_names, {}
     for stamp in given.keypoints.keys() & poses.keys():
@@ -188,7 +188,7 @@ def _true_depths(given: Given, weight: float = LIFTED_WEIGHT) -> Given:
     names = given.clip.truth.joint_names
     kinds = {name.rpartition('_')[2] for name in names if name in body.joint_names} | {'hip'}
     if given.real:
-        kinds -= {'head', 'toe'}  # other places than those of our bodies
+        kinds -= {'head', 'toe'}  # defined differently in the body model
     depths = {}
     for stamp, pose in poses.items():
         places = body.joint_positions(pose[None])[0]
@@ -262,7 +262,7 @@ ORACLES: dict[str, Callable[[Given], Given]] = {
     'no experts': _without_experts,
     'no depths': _without_depths,
 }
-# Inputs of a run of the floors, and the names of these.
+# `inputs` of a run that computes the floors, and names of the floors.
 FLOOR = ''
 FLOORS = ('floor, true lengths', 'floor, lengths at the start')
 
@@ -272,10 +272,10 @@ FLOORS = ('floor, true lengths', 'floor, lengths at the start')
 
 @dataclass(frozen=True)
 class OracleRun(Run):
-    """A run with an oracle; '': the floors of a clip.
+    """A run with an oracle.
 
     Attributes:
-        oracle: one of `ORACLES`.
+        oracle: one of `ORACLES`; empty for the floors of a clip.
     """
 
     oracle: str = ''
@@ -283,7 +283,7 @@ class OracleRun(Run):
 
 @lru_cache(maxsize=1)
 def given_of(folder: Path, limit: int | None) -> Given:
-    """What the plain tracker is given of a clip, or its first images, and the truth."""
+    """Inputs of the plain tracker for a clip, or for its first images, and the truth."""
     clip, body = read_clip(folder, limit), load_body('human37')
     real = folder.name in REAL
     own = _with_lengths(body, clip, real)
@@ -294,7 +294,7 @@ def given_of(folder: Path, limit: int | None) -> Given:
 
 
 def _with_lengths(body: Body, clip: Clip, real: bool) -> Body:
-    """The body with the true lengths; of real clips those between joints that are scored."""
+    """The body with the true lengths; for real clips those between scored joints."""
     if not real:
         return with_true_lengths(body, clip)
     truth = _scored_truth(clip)
@@ -323,7 +323,7 @@ def _scored_truth(clip: Clip) -> Any:
 
 
 def _at_truth(body: Body, clip: Clip, stamps: list[int], real: bool) -> Array:
-    """Poses (T, d) of a body that come nearest to the truth."""
+    """Poses (T, d) of a body nearest to the truth."""
     if real:
         clip = replace(clip, truth=_scored_truth(clip))
     starts = np.tile(body.prior_mean, (HEADINGS, 1))
@@ -334,7 +334,7 @@ def _at_truth(body: Body, clip: Clip, stamps: list[int], real: bool) -> Array:
 
 
 def scores_of_run(one: OracleRun) -> dict[str, dict[str, Any]]:
-    """Scores by the name of the row, of which a run may have two."""
+    """Scores of a run by table row; some runs have two rows."""
     given = given_of(one.folder, one.limit)
     if not one.oracle:
         poses = given.fitted[1]
@@ -354,7 +354,7 @@ def scores_of_run(one: OracleRun) -> dict[str, dict[str, Any]]:
 
 
 def scores_with(given: Given, one: OracleRun) -> dict[str, dict[str, Any]]:
-    """Scores of a run with what the tracker is given, by the name of the row."""
+    """Scores of a run with given inputs, by table row."""
     with patch.object(keypoint_term, 'LIFTED_WEIGHT', given.depth_weight):
         modes = _tracked(given, one)
     result = {one.oracle: _scores(given.clip, modes)}
@@ -367,7 +367,7 @@ Modes = dict[int, tuple[Body, Array, Array]]
 
 
 def _tracked(given: Given, one: OracleRun) -> Modes:
-    """Body, poses (K, d) and weights (K,) by stamp."""
+    """Body, poses (K, d) and weights (K,) by timestamp."""
     clip, settings = given.clip, given.settings
     if one.inputs == KEYPOINTS:
         settings = keypoints_only(settings)
@@ -400,8 +400,8 @@ def _middle(places: Array, names: Sequence[str], of: Sequence[str]) -> Array:
 def _scores(clip: Clip, modes: Modes, *, right_way: bool = False) -> dict[str, Any]:
     """Errors of modes, mm, means over the images.
 
-    Of the heaviest mode also `lean` of the trunk towards the camera, degrees, and `shin`, mm, ours
-    less the true ones; NaN: unknown.
+    Also the errors of the heaviest mode in `lean` of the trunk towards the camera, degrees, and in
+    the length `shin`, mm, estimated minus true; NaN if unknown.
     """
     truth = clip.truth
     names = [x for x in EVALUATED_JOINTS if x in truth.joint_names]
@@ -449,7 +449,7 @@ SCORES = ('heaviest', 'best', 'along', 'across', 'lean', 'shin')
 
 
 def _across(joints: Array, names: list[str]) -> Array:
-    """From right to left (N, 3), by the shoulders, and the hips if they are known."""
+    """Vectors (N, 3) from right to left, from the shoulders and, if known, the hips."""
     pairs = [x for x in (SHOULDERS, HIPS) if {*x} <= {*names}]
     sides = [joints[:, names.index(a)] - joints[:, names.index(b)] for a, b in pairs]
     result: Array = np.sum(sides, axis=0)
@@ -482,7 +482,7 @@ def measure(
     """Scores by group, clip, input and oracle, means over seeds.
 
     Raises:
-        FileNotFoundError: the clips are not there.
+        FileNotFoundError: the clips are missing.
         ValueError: a clip can not be read.
     """
     names = [x for group in GROUPS.values() for x in group if x in (only or x)]
@@ -521,7 +521,7 @@ def _mean_of(scores: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _kept(one: OracleRun) -> dict[str, dict[str, Any]]:
-    """The scores of a run, which are kept until the code changes."""
+    """The scores of a run, cached until the code changes."""
     own = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:8]
     path = KEPT / f'{name_of(one)}-{own}.oracle'
     if not path.is_file():
@@ -537,7 +537,7 @@ KINDS = ('neck', 'shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle')
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """Tables for people, real clips first; mm unless said."""
+    """Human-readable tables, real clips first; mm unless stated otherwise."""
     parts = [f'seeds {", ".join(map(str, result["seeds"]))}; gravity given where it is known; mm']
     entries, given = result['oracles'], dict.fromkeys(x['inputs'] for x in result['oracles'])
     for group, names in GROUPS.items():
@@ -564,7 +564,7 @@ def _oracle_table(
     markdown: bool,
     shown: tuple[str, str] = MODES,
 ) -> str:
-    """Two scores of each clip by oracle; beside those of the modes, means over the clips."""
+    """Two scores of each clip by oracle; for scores of modes also means over the clips."""
     heads = ('heaviest', 'best', 'along', 'across') if shown == MODES else ()
     rows = [['oracle', *heads, *(['gain'] if heads else []), *clips]]
     usual = _column([x for x in entries if x['oracle'] == PLAIN], 'heaviest')

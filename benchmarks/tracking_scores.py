@@ -1,4 +1,4 @@
-"""What the record of a run says: errors, calibration and motion, against the truth of its clip.
+"""Scores of a run's record against the truth of its clip: errors, calibration and motion.
 
 Joints are compared relative to the origin, as in `hmt_ros.evaluation.pose_scores`.
 """
@@ -22,7 +22,7 @@ from hmt_ros.tracking import Status
 Array = NDArray[np.float64]
 
 ANKLES = ('left_ankle', 'right_ankle')
-# Images are consecutive when no more time passes than this, in usual intervals.
+# Maximum interval between consecutive images, in usual intervals.
 LONGEST_INTERVAL = 1.5
 DRAWS = 2000
 # Keys of what `scores_of` returns besides `by_joint_90`.
@@ -34,7 +34,7 @@ SCORES = (
     'acceleration', 'feet', 'wrong_way', 'wrong_way_images', 'wrong_sign', 'nobody',
     'evaluations', 'evaluations_99', 'ms', 'cpu_ms',
 )  # fmt: skip
-# Segments of limbs whose depth sign is scored, and the least angle to the image plane, rad.
+# Segments of limbs whose depth sign is scored, and the minimum angle to the image plane, rad.
 LIMBS = tuple(
     (f'{side}_{near}', f'{side}_{far}')
     for near, far in (
@@ -43,7 +43,7 @@ LIMBS = tuple(
     for side in ('left', 'right')
 )  # fmt: skip
 SLANTED = np.radians(15.0)
-# Shortest true path of the root that is scored, m, and the steps that paths are measured in, s.
+# Minimum length of a true path for its scores, m, and time step of path lengths, s.
 LEAST_PATH, PATH_STEP = 1.0, 0.5
 
 
@@ -52,13 +52,13 @@ def scores_of(record: Record) -> dict[str, Any]:
 
     Returns:
         Mean distances of the joints in mm: `heaviest_mm` of the heaviest mode, `lagged_mm` of the
-        heaviest one by what became of the modes in the next `LAG` images, `expected_mm` of the
+        heaviest one given the next `LAG` images, `expected_mm` of the
         weighted mean of the modes, `point_mm` of the point estimate, `best_mm` of the best mode,
         `blind_mm` of the blind control, `aligned_mm` of the point estimate after the similarity
         that fits best. Of the point estimate also `root_percent`, distance of the origin from its
         true position, and `depth_percent`, signed, both in % of the true distance and depth;
         `path_percent`, the same distance in the world in % of the length of the true path, and
-        `path_length_percent`, by how much the estimated path is longer, where the true one has
+        `path_length_percent`, the excess length of the estimated path, if the true one has
         `LEAST_PATH`;
         `acceleration` over that of the truth; `feet`, the speed of standing ankles, m/s. `kept` is
         the share of all images whose heaviest mode errs by less than 150 mm. Of the density:
@@ -72,7 +72,7 @@ def scores_of(record: Record) -> dict[str, Any]:
         `wrong_sign`, the share of slanted limbs whose slope in depth has the wrong sign. `nobody`
         is the share of all images in which the track had ended. `evaluations` is the mean number in
         an image, `evaluations_99` the 99th percentile; `ms` the median time of a step, `cpu_ms` its
-        mean processor time. What is unknown is NaN; of
+        mean processor time. Unknown scores are NaN; of
         a run that found nobody, only `kept` is known.
     """
     if len(record.stamps) == 0:
@@ -126,7 +126,7 @@ def scores_of(record: Record) -> dict[str, Any]:
 
 
 def absolute_scores(record: Record) -> dict[str, float]:
-    """What regions of single joints in the frame of the camera hold, and their size; else NaN."""
+    """Coverage and volume of regions of single joints in the camera frame; NaN if unknown."""
     levels, volumes = record.absolute_levels, record.volumes
     known = levels.size > 0
     return {
@@ -137,7 +137,7 @@ def absolute_scores(record: Record) -> dict[str, float]:
 
 
 def scores_of_nobody() -> dict[str, Any]:
-    """Scores of a run in which no image had a posterior: nothing was kept, the rest is unknown."""
+    """Scores of a run without any posterior: `kept` is 0, the others are unknown."""
     return {
         **dict.fromkeys(SCORES, np.nan),
         'kept': 0.0,
@@ -146,11 +146,11 @@ def scores_of_nobody() -> dict[str, Any]:
 
 
 def lagged_error(record: Record, errors: Array) -> float:
-    """Mean error of the mode that later images make the heaviest, mm; NaN: unknown.
+    """Mean error of the mode that is heaviest given later images, mm; NaN if unknown.
 
     Args:
-        record: of a run.
-        errors: (T, K) of the modes, m.
+        record: record of a run.
+        errors: (T, K) errors of the modes, m.
     """
     if record.lagged.shape != errors.shape:
         return float('nan')
@@ -167,8 +167,8 @@ def hips_error(record: Record, known: NDArray[np.bool_]) -> float:
     """Mean error of the heaviest mode's joints relative to the middle of the hips, mm.
 
     Args:
-        record: of a run.
-        known: (J - 1,) scored joints that have a truth.
+        record: record of a run.
+        known: (J - 1,) whether each scored joint has a truth.
     """
     hips = [JOINTS.index(name) for name in HIPS]
     both = (heaviest_joints(record), record.true)
@@ -179,7 +179,7 @@ def hips_error(record: Record, known: NDArray[np.bool_]) -> float:
 def facing_scores(record: Record) -> dict[str, float]:
     """Share and number of images in which the heaviest mode faces the wrong way.
 
-    That is by more than 90 degrees. NaN: the truth lacks hips or shoulders.
+    Wrong means by more than 90 degrees. NaN if the truth lacks hips or shoulders.
     """
     own, true = (facing(joints) for joints in (heaviest_joints(record), record.true))
     agreement = (own * true).sum(1)
@@ -190,11 +190,11 @@ def facing_scores(record: Record) -> dict[str, float]:
 
 
 def facing(joints: Array) -> Array:
-    """Directions (T, 3) that people face, of no certain length, from joints (T, J, 3).
+    """Directions (T, 3) in which people face, not normalised, from joints (T, J, 3).
 
         (left - right) x (shoulders - hips),    left - right of hips and shoulders together
 
-    Forwards, in right-handed frames.
+    They point forwards in right-handed frames.
     """
     left_hip, right_hip, left_shoulder, right_shoulder = (
         joints[:, JOINTS.index(f'{side}_{name}')]
@@ -209,23 +209,23 @@ def facing(joints: Array) -> Array:
 def wrong_sign(record: Record) -> float:
     """Share of slanted limbs of the heaviest mode that lean the wrong way in depth.
 
-    Limbs are upper and lower arms and legs; one is slanted where its true angle to the image plane
-    is more than `SLANTED`. NaN: none is.
+    Limbs are upper and lower arms and legs; a limb is slanted if its true angle to the image plane
+    is more than `SLANTED`. NaN if none is.
     """
     near, far = ([JOINTS.index(ends[i]) for ends in LIMBS] for i in (0, 1))
     own, true = (x[:, far] - x[:, near] for x in (heaviest_joints(record), record.true))
     lengths = np.linalg.norm(true, axis=2)
-    slanted = np.abs(true[..., 2]) > np.sin(SLANTED) * lengths  # false where there is no truth
+    slanted = np.abs(true[..., 2]) > np.sin(SLANTED) * lengths  # false without truth
     if not slanted.any():
         return float('nan')
     return float((own[..., 2] * true[..., 2] < 0)[slanted].mean())
 
 
 def absent_share(record: Record) -> float:
-    """Share of the images of a run in which its track had ended; NaN: unknown.
+    """Share of the images of a run in which its track had ended; NaN if unknown.
 
-    From the first image that is tracked, those count in which the tracker says that nobody is in
-    view, or waits for somebody to begin a new track with.
+    These are images after the first tracked one in which the tracker reports nobody in view, or
+    waits for a person to start a new track.
     """
     without = np.isin(record.statuses, [Status.NOBODY.value, Status.WAITING.value])
     if without.all():
@@ -234,12 +234,12 @@ def absent_share(record: Record) -> float:
 
 
 def detector_scores(folder: Path, limit: int | None = None, rate: float = 0.0) -> dict[str, Any]:
-    """The same of a detector's own 3D poses, where it has them: twelve joints, aligned at the hips.
+    """The same scores of a detector's own 3D poses, if any: twelve joints, aligned at the hips.
 
     Args:
-        folder: of the clip.
-        limit: number of images; None: all.
-        rate: images a second at most; 0: all.
+        folder: folder of the clip.
+        limit: maximum number of images; None means all.
+        rate: maximum number of images per second; 0 means all.
 
     Raises:
         ValueError: the clip has no keypoints of a detector.
@@ -298,9 +298,9 @@ def acceleration_ratio(stamps: NDArray[np.int64], joints: Array, true: Array) ->
 
 
 def path_scores(record: Record) -> dict[str, float]:
-    """Scores of the path of the point estimate's origin in the world; NaN: nobody goes anywhere."""
+    """Scores of the path of the point estimate's origin in the world; NaN if it is too short."""
     own, true = (in_world(record, joints[:, :1])[:, 0] for joints in (record.point, record.true))
-    # Steps in which nobody's trembling adds to the length.
+    # Steps are long, so that jitter does not add to the length.
     usual = np.median(np.diff(record.stamps)) if len(own) > 1 else 1e9
     step = max(round(PATH_STEP * 1e9 / usual), 1)
     lengths = [np.linalg.norm(np.diff(x[::step], axis=0), axis=1).sum() for x in (own, true)]
@@ -314,14 +314,14 @@ def path_scores(record: Record) -> dict[str, float]:
 
 
 def in_world(record: Record, joints: Array) -> Array:
-    """Joints (T, J, 3) of the camera frames of a record in the world, m."""
+    """Joints (T, J, 3) of a record, transformed from camera frames to the world, m."""
     rotations, positions = record.views[:, :, :3], record.views[:, None, :, 3]
     result: Array = joints @ rotations.transpose(0, 2, 1) + positions
     return result
 
 
 def standing_speed(record: Record) -> float:
-    """Speed of the point estimate's ankles in the world while the feet stand, m/s; NaN: unknown."""
+    """World speed of the point estimate's ankles while the feet stand, m/s; NaN if unknown."""
     if len(record.contact) == 0:
         return float('nan')
     placed = in_world(record, record.point[:, [JOINTS.index(name) for name in ANKLES]])
@@ -334,15 +334,15 @@ def standing_speed(record: Record) -> float:
 def interval(
     values: Array, *, draws: int = DRAWS, seed: int = 0
 ) -> tuple[float | None, float | None, float | None]:
-    """Mean over clips with the interval that holds it with a probability of 95 %, by bootstrap.
+    """Mean over clips with its 95 % interval, by bootstrap.
 
-    Clips are drawn with replacement, and of each drawn clip its seeds. Clips without values are
+    Clips are drawn with replacement, then seeds within each drawn clip. Clips without values are
     left out.
 
     Args:
-        values: (clips, seeds); NaN: unknown.
+        values: (clips, seeds) scores; NaN if unknown.
         draws: number of draws.
-        seed: of the draws.
+        seed: seed of the draws.
 
     Returns:
         Mean, lower and upper end; None without values. One clip has no interval.
@@ -367,7 +367,7 @@ def interval_over_seeds(differences: Array) -> tuple[float, float] | None:
     A few seeds are too few for a bootstrap, whose interval would be too narrow.
 
     Returns:
-        Lower and upper end; None: fewer than two seeds, or one is unknown.
+        Lower and upper end; None for fewer than two seeds or unknown values.
     """
     n = len(differences)
     if n < 2 or not np.isfinite(differences).all():
@@ -383,7 +383,7 @@ def _distances(joints: Array, true: Array) -> Array:
 
 
 def _consecutive(stamps: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """(T - 1,) whether an image follows on the one before it without a gap."""
+    """(T - 1,) whether an image follows the previous one without a gap."""
     gaps = np.diff(stamps)
     usual = np.median(gaps) if len(gaps) else 0.0
     return np.asarray(gaps <= LONGEST_INTERVAL * usual, dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""How long a step of the tracker takes, and where the time goes."""
+"""Duration of a step of the tracker, in total and by stage."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from benchmarks.machine import forget_peak, peak_memory
 from benchmarks.runs import IMAGES, INPUTS, begun
 
 OPENCV = 'MOG2 + Canny + distance transform'
-# Images a second besides all of them, and images that start a track.
+# Lower rate in images per second, and number of images that start a track.
 LOW_RATE, STARTING = 3.0, 2
-# Clips whose steps are priced, where they are there.
+# Clips whose steps are measured, if available.
 PRICED = ('walk', 'kick', 'dab', 'turns', 'window')
 
 
 def speed(clip: Clip) -> dict[str, Any]:
-    """Time of a step and of its stages, and of OpenCV's work on the same images, in turn.
+    """Times of a step, of its stages, and of OpenCV's work on the same images, alternating.
 
-    The camera of the clip does not move.
+    The camera of the clip must be fixed.
     """
-    # Here, so that the other parts need no inner modules of the tracker.
+    # Imported here, so that the other parts need no inner modules of the tracker.
     from benchmarks.stages import StageClock
 
     assert clip.background is not None
@@ -36,7 +36,7 @@ def speed(clip: Clip) -> dict[str, Any]:
     subtractor = cv2.createBackgroundSubtractorMOG2()
     for _ in range(10):
         subtractor.apply(clip.background)
-    # Load everything before anything is timed.
+    # A warm-up loads everything before anything is timed.
     for stamp, image in islice(zip(clip.stamps, clip.images, strict=True), 3):
         tracker.step(image, stamp)
     tracker = begun(clip, IMAGES)[0]
@@ -51,7 +51,7 @@ def speed(clip: Clip) -> dict[str, Any]:
             opencv_work(subtractor, image)
             reference.append(time.perf_counter() - middle)
             steps.append(middle - start)
-            if i == 0:  # the start of a track is told apart
+            if i == 0:  # the start of a track is reported separately
                 begin = clock.seconds.copy()
                 clock.seconds.clear()
     count = len(steps) - 1
@@ -74,13 +74,13 @@ def speed(clip: Clip) -> dict[str, Any]:
 
 
 def costs(folder: Path, limit: int | None = None) -> list[dict[str, Any]]:
-    """Processor time of a step, over that of OpenCV's work on the same image, in the same run.
+    """Processor time of a step relative to OpenCV's work on the same image in the same run.
 
-    One row an input and a rate: all images, and 3 a second.
+    There is one row per input and rate: all images, and 3 per second.
 
     Args:
-        folder: of a clip with a background.
-        limit: number of images; None: all.
+        folder: folder of a clip with a background.
+        limit: maximum number of images; None means all.
 
     Raises:
         ValueError: the clip can not be read.
@@ -102,7 +102,7 @@ def costs(folder: Path, limit: int | None = None) -> list[dict[str, Any]]:
                 evaluations.append(tracker.estimate.evaluations)
             if len(spent) <= STARTING:
                 continue
-            # The first images start the track, and load everything.
+            # The first images start the track and load everything, so they are not counted.
             steps, one = np.array(spent[STARTING:]), float(np.mean(floor[STARTING:]))
             rows.append(
                 {
@@ -122,7 +122,7 @@ def costs(folder: Path, limit: int | None = None) -> list[dict[str, Any]]:
 
 
 def costs_as_text(rows: Sequence[dict[str, Any]], *, markdown: bool = False) -> str:
-    """A table, with the means over the clips last."""
+    """A table, with means over the clips for each input and rate."""
     head = ['clip', 'inputs', 'rate', 'evaluations', 'CPU, ms', 'floors', 'median', '99 %']
     names = ('evaluations', 'cpu_ms', 'mean', 'median', 'most')
     lines = []
@@ -137,7 +137,7 @@ def costs_as_text(rows: Sequence[dict[str, Any]], *, markdown: bool = False) -> 
 
 
 def opencv_work(subtractor: Any, image: Any) -> Any:
-    """What OpenCV does for a silhouette, edges and distances to them."""
+    """OpenCV's work for a silhouette, edges and a distance transform."""
     mask = subtractor.apply(image)
     edges = cv2.Canny(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), 40, 100)
     return mask, cv2.distanceTransform(255 - edges, cv2.DIST_L2, 5)

@@ -15,10 +15,10 @@ class Column(NamedTuple):
     """A column of a table.
 
     Attributes:
-        head: of the column.
-        key: of the score.
-        form: of a number.
-        factor: that the score is multiplied with.
+        head: title of the column.
+        key: key of the score.
+        form: number format.
+        factor: factor on the score.
     """
 
     head: str
@@ -31,7 +31,7 @@ class Column(NamedTuple):
         if value is None:
             return '-'
         text = format(self.factor * value, sign + self.form)
-        # Without the sign of a zero that was rounded from below.
+        # Negative numbers that round to zero are shown without sign.
         return format(0.0, sign + self.form) if float(text) == 0.0 else text
 
 
@@ -63,12 +63,12 @@ CALIBRATION = (
     Column('acceleration', 'acceleration', '.1f'), Column('feet, m/s', 'feet', '.2f'),
     EVALUATIONS,
 )  # fmt: skip
-# Large mistakes, and what an image costs.
+# Large mistakes, and the cost of an image.
 MISTAKES = (
     WRONG_WAY, Column('images', 'wrong_way_images', '.1f'), WRONG_SIGN, NOBODY,
     EVALUATIONS, Column('99 %', 'evaluations_99'), Column('ms', 'ms'), CPU,
 )  # fmt: skip
-# Of two kinds of settings.
+# Columns for comparisons of two settings or checkouts.
 COMPARED = tuple(
     column._replace(form=column.form.replace('.0f', '.1f'))
     for column in (
@@ -80,7 +80,7 @@ WORST_JOINT = 'worst joint 90 %'
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """Tables for people."""
+    """Human-readable tables."""
     parts = [f'{result["clips"]}; seeds {", ".join(map(str, result["seeds"]))}']
     if result['without_keypoints']:
         parts.append(
@@ -120,7 +120,7 @@ def _table(
     sign: str = '',
     worst_joint: bool = False,
 ) -> str:
-    """Clips and inputs, then means of each input with their intervals."""
+    """Table of clips and inputs, then means of each input with their intervals."""
     extra = [WORST_JOINT] if worst_joint else []
     entries = [*group['clips'], *group['means']]
     rated = ['rate'] if any(entry['rate'] > 0 for entry in entries) else []
@@ -150,12 +150,12 @@ def _rate(rate: float) -> str:
 
 
 def _gravity(entry: dict[str, Any]) -> str:
-    """Whether gravity was given; a detector takes none."""
+    """Whether gravity was given; a detector does not use it."""
     return '-' if entry['inputs'] == DETECTOR else str(entry['gravity'])
 
 
 def _tables_of_comparison(found: dict[str, Any], what: str, markdown: bool) -> list[str]:
-    """Differences by group, of all clips together, and paired ones of the heaviest mode."""
+    """Tables of differences by group, over all clips, and paired ones of the heaviest mode."""
     parts = []
     for group in found['groups']:
         parts.append(f'{group["group"]}: {what}, mm.')

@@ -1,7 +1,7 @@
-"""The pose and the lengths of a body that come nearest to the truth of a clip.
+"""Poses and lengths of a body fitted to the truth of a clip.
 
-What the fits of noise start from: what is left between the model and a clip is then an error of the
-cues and of the model, not of a search.
+Fits of noise start from them, so that the remaining difference between model and clip is an error
+of the cues and of the model, not of a search.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from hmt_ros.tracking.initialisation import start_from_keypoints
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Clips that the fits learn from, and how many, and images of each, with --quick.
+# Clips for the fits; number of clips, and of images of each, with --quick.
 CLIPS = ('walk', 'charleston', 'wander', 'shoot', 'signals', 'scoop', 'kick', 'follow')
 QUICK, QUICK_IMAGES = 1, 24
-# Poses from which the best pose of the body is fitted.
+# Number of initial poses for the fit of a pose.
 STARTS = 8
 SHOULDERS = ('left_shoulder', 'right_shoulder')
 SUBTRACTED, TRUE = 'subtracted', 'true'
@@ -37,7 +37,7 @@ Ends = tuple[tuple[str, ...], tuple[str, ...]]
 
 
 class Fitted(NamedTuple):
-    """A clip, the body with the true lengths, and poses (N, d) to start from."""
+    """A clip, the body with the true lengths, and initial poses (N, d)."""
 
     clip: Clip
     body: Body
@@ -48,7 +48,7 @@ def fitted(folder: Path, limit: int | None = None) -> Fitted:
     """Reads a clip, or its first images.
 
     Raises:
-        ValueError: it can not be read.
+        ValueError: the clip can not be read.
     """
     clip, model = read_clip(folder, limit), load_body('human37')
     begun = start_from_keypoints(model, clip.camera, read_subject(clip.subject, model))
@@ -59,7 +59,7 @@ def _on_both_sides(first: str, second: str) -> list[Ends]:
     return [((f'{side}_{first}',), (f'{side}_{second}',)) for side in ('left', 'right')]
 
 
-# Between which joints, or middles of joints, a length is measured.
+# Joints, or pairs of joints with a middle, between which each length is measured.
 SPANS: dict[str, list[Ends]] = {
     'thigh': _on_both_sides('hip', 'knee'),
     'shin': _on_both_sides('knee', 'ankle'),
@@ -76,7 +76,7 @@ SPANS: dict[str, list[Ends]] = {
 
 
 def best_poses(body: Body, clip: Clip, stamps: list[int], starts: Array) -> Array:
-    """Poses (T, d) of a body that come nearest to the true joints, each from several starts."""
+    """Poses (T, d) of a body nearest to the true joints, each the best of several starts."""
     names = [name for name in JOINTS if name in clip.truth.joint_names]
     where = [clip.truth.joint_names.index(name) for name in names]
     true = np.array([clip.truth.joints[stamp][where] for stamp in stamps])
@@ -88,7 +88,7 @@ def best_poses(body: Body, clip: Clip, stamps: list[int], starts: Array) -> Arra
 
 
 def silhouettes_of(clip: Clip, every: int) -> dict[str, list[Mask]]:
-    """Silhouettes of each of so many images: subtracted and true, where they are known."""
+    """Subtracted and true silhouettes, if known, in every `every`-th image."""
     result = {}
     if clip.background is not None:
         background = BackgroundModel.from_image(clip.background)
@@ -107,7 +107,7 @@ def silhouettes_of(clip: Clip, every: int) -> dict[str, list[Mask]]:
 def with_true_lengths(body: Body, clip: Clip) -> Body:
     """A body with the lengths between the true joints, means over the images and both sides.
 
-    Lengths whose joints have no truth stay as they are.
+    Lengths whose joints have no truth are unchanged.
     """
     names, every = clip.truth.joint_names, np.array(list(clip.truth.joints.values()))
 
@@ -126,7 +126,7 @@ def with_true_lengths(body: Body, clip: Clip) -> Body:
         place = {name: at((name,)) for name in (ORIGIN, *HIPS)}
         up = at(('neck',)) - trunk_start(body.skeleton, place)
         lengths['trunk'] = float(np.linalg.norm(up, axis=1).mean())
-        # How far the shoulders are above the end of the trunk, which may be less than nothing.
+        # Height of the shoulders above the end of the trunk, which may be negative.
         up /= np.linalg.norm(up, axis=1, keepdims=True)
         lengths['shoulder_rise'] = float(((at(SHOULDERS) - at(('neck',))) * up).sum(1).mean())
     return body.with_segment_lengths(lengths)

@@ -1,13 +1,13 @@
-"""unseen: what is said of limbs that no image shows, on clips of which a part is cut off.
+"""unseen: estimates of limbs that no image shows, on clips with a part cut off.
 
-    waist, knees   the images end there, keypoints below have not been seen
-    pillar         a grey band of the scene, also when it is empty, covers one side of the person
+    waist, knees   the images end there, and keypoints below are missing
+    pillar         a grey band, also in the empty scene, covers one side of the person
 
-The tracker starts with the keypoints of a detector. Of the joints that are hidden, relative to the
-pelvis and in the frame of the camera: errors of the weighted mean, published deviation (the root of
-the trace of the covariance of all modes together), how many lie in their regions of 90 %, and log
-densities of the truth; how many are in the space that robots keep out of, at 0.99. Beside them the
-error of the joints in view.
+The tracker starts with the keypoints of a detector. Scores of the hidden joints, relative to the
+pelvis and in the camera frame: errors of the weighted mean, published deviation (the root of the
+trace of the covariance of all modes together), share within 90 % regions, and log density of the
+truth; and their share in the keep-out space of robots at 0.99. The error of the visible joints is
+also given.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ WAIST, KNEES, PILLAR = 'waist', 'knees', 'pillar'
 CUTS = (WAIST, KNEES, PILLAR)
 JOINTS_AT = {WAIST: ('left_hip', 'right_hip'), KNEES: ('left_knee', 'right_knee')}
 RATE, SEED, SAMPLES, HELD = 8.0, 0, 200, 0.9
-# Images after the start that are not scored, half width of the pillar against the height of the
-# person, and its colour.
+# Number of images after the start that are not scored; half width of the pillar relative to the
+# height of the person; grey level of the pillar.
 SETTLING, HALF, GREY = 2, 0.12, 120
-QUICK = 6  # images
+QUICK = 6  # number of images with --quick
 SCORES = ('off', 'ankle', 'deviation', 'held', 'held_absolute', 'density', 'kept', 'seen')
 
 
 class Work(NamedTuple):
-    """A clip, how it is cut, what the tracker is given, and the number of images; None: all."""
+    """A clip, its cut, the inputs of the tracker, and the number of images; None means all."""
 
     folder: Path
     cut: str
@@ -57,7 +57,7 @@ class Work(NamedTuple):
 
 
 def hidden_area(clip: Clip, cut: str) -> Mask:
-    """Pixels (H, W) that a cut clip does not show: below a row, or in a band of columns."""
+    """Mask (H, W) of the pixels that a cut clip hides: below a row, or in a band of columns."""
     height, width = clip.images[0].shape[:2]
     area = np.zeros((height, width), dtype=np.bool_)
     names = clip.truth.joint_names
@@ -75,7 +75,7 @@ def hidden_area(clip: Clip, cut: str) -> Mask:
 
 
 def cut_clip(clip: Clip, cut: str) -> tuple[Clip, Mask]:
-    """The clip as a camera sees it, and `hidden_area`."""
+    """The clip with a part cut off, and its `hidden_area`."""
     area = hidden_area(clip, cut)
     kept = slice(None)
     camera = clip.camera
@@ -94,7 +94,7 @@ def cut_clip(clip: Clip, cut: str) -> tuple[Clip, Mask]:
 
 
 def is_hidden(area: Mask, pixels: Array) -> Mask:
-    """Whether pixels (N, 2) lie in an area or outside of the image."""
+    """Whether pixels (N, 2) lie in an area or outside the image."""
     height, width = area.shape
     column, row = np.nan_to_num(pixels, nan=-1.0).round().astype(np.intp).T
     inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
@@ -104,7 +104,7 @@ def is_hidden(area: Mask, pixels: Array) -> Mask:
 
 
 def shown(keypoints: Keypoints, area: Mask, hidden: set[str]) -> Keypoints:
-    """Keypoints without those that lie in an area or name a hidden joint."""
+    """Keypoints without those that lie in an area or belong to a hidden joint."""
     gone = is_hidden(area, keypoints.pixels) | [name in hidden for name in keypoints.names]
     return replace(
         keypoints,
@@ -177,7 +177,7 @@ def measure(
     clips: Path | None = None, *, quick: bool = False, names: tuple[str, ...] = CLIPS,
     cuts: tuple[str, ...] = CUTS, inputs: tuple[str, ...] = (BOTH, KEYPOINTS),
 ) -> dict[str, Any]:  # fmt: skip
-    """What `of_clip` finds.
+    """Scores of `of_clip` for all clips, cuts and inputs.
 
     Raises:
         FileNotFoundError: there are no clips.
@@ -197,7 +197,7 @@ def measure(
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """A table for people."""
+    """Human-readable table."""
     head = [
         'inputs', 'cut', 'clip', 'answered', 'off, mm', 'ankles, mm', 'said, cm', 'in 90 %',
         'absolute', 'log density', 'kept out', 'others, mm',

@@ -1,7 +1,8 @@
-"""vertical: how well the lines of a scene tell which way is up, and what a look costs.
+"""vertical: accuracy and cost of the vertical estimated from the lines of a scene.
 
-All clips whose truth has the direction of gravity, an image of each second. A look is compared with
-the background subtraction, edges and distances of one image, the least that a step does.
+It uses all clips whose truth contains gravity, with one image per second. The cost of an estimate
+is compared with background subtraction, edges and distance transform of one image, the minimum of a
+step.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from benchmarks.machine import description
 from benchmarks.tracking_speed import opencv_work
 from hmt_ros.image.vertical_lines import seen_vertical, straight_lines
 
-RATE = 1.0  # images a second
+RATE = 1.0  # images per second
 REPEATS = 3
 
 
 def measured(folder: Path) -> dict[str, Any] | None:
-    """Errors of a clip, deg, and times, ms; None: its truth does not tell which way is up."""
+    """Errors of a clip, deg, and times, ms; None if its truth lacks gravity."""
     clip = at_rate(read_clip(folder), RATE)
     images = zip(clip.stamps, clip.images, strict=True)
     looks = [(clip.ups[stamp], image) for stamp, image in images if stamp in clip.ups]
@@ -56,7 +57,7 @@ def measured(folder: Path) -> dict[str, Any] | None:
 
 
 def _least(work: Callable[[], object]) -> float:
-    """Least time of some runs, s."""
+    """Minimum time of some runs, s."""
     times = []
     for _ in range(REPEATS):
         start = time.perf_counter()
@@ -66,10 +67,10 @@ def _least(work: Callable[[], object]) -> float:
 
 
 def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]:
-    """What `measured` finds on the clips.
+    """Results of `measured` for all clips.
 
     Raises:
-        ValueError: one can not be read.
+        ValueError: a clip can not be read.
     """
     folders = find_clips(clips, moving=True, quick=quick)[0]
     found = [one for x in told('vertical', folders, lambda x: x.name) if (one := measured(x))]
@@ -77,7 +78,7 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """What is printed."""
+    """Human-readable table."""
     rows = [
         ['clip', 'tilt of the camera, deg', 'lines', 'looks that tell', 'median error, deg',
          'largest', 'said', 'ms', 'floors'],
@@ -101,7 +102,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
 
 
 def _all(clips: list[dict[str, Any]]) -> dict[str, Any]:
-    """All clips as one."""
+    """Combined result of all clips."""
 
     def every(name: str) -> list[float]:
         return [x for one in clips for x in one[name]]

@@ -1,4 +1,4 @@
-"""Pictures of bodies for the pages: solid bodies in a camera's image and seen from above."""
+"""Pictures of bodies for the pages: solid bodies in a camera's image and from above."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hmt_ros.body.kinematics import forward
 Array = NDArray[np.float64]
 
 TRUNK = '#9a9a9a'
-# Of figures that are 8.4 inches wide, which pages show smaller.
+# Style of figures 8.4 inches wide, which pages show smaller.
 PAGE_STYLE: Any = {**STYLE, 'font.size': 10.0, 'axes.titlesize': 10.0}
 # Half the width of a picture from above, m.
 REACH = 0.85
@@ -31,12 +31,12 @@ def add_body(
     """Draws a solid body (left limbs orange, right limbs blue) into the axes.
 
     Args:
-        axes: of the picture.
-        body: with flesh.
-        pose: (d,).
-        camera: into whose image, px; None: from above, m to the right of the pelvis and away from
-            the camera.
-        alpha: how opaque it is.
+        axes: axes of the picture.
+        body: body with flesh.
+        pose: pose (d,).
+        camera: camera whose image is drawn, px; None draws from above, m to the right of the
+            pelvis and away from the camera.
+        alpha: opacity.
     """
     mesh = body.flesh.mesh()
     frames = forward(body.skeleton, pose[None])
@@ -84,7 +84,7 @@ def from_above(points: Array, pelvis: Array) -> Array:
 
 
 def frame_above(axes: Axes) -> None:
-    """A picture from above, the camera below it."""
+    """Sets the axes for a view from above, with the camera at the bottom."""
     axes.set(xlim=(-REACH, REACH), ylim=(-REACH, REACH), aspect='equal', xticks=[], yticks=[])
     _without_frame(axes)
 
@@ -92,7 +92,7 @@ def frame_above(axes: Axes) -> None:
 def frame_image(
     axes: Axes, image: NDArray[np.uint8] | None, box: tuple[float, float, float, float]
 ) -> None:
-    """Part of an image (H, W, 3), BGR; None: of an empty one. The box is that of `box_of`."""
+    """Shows part of an image (H, W, 3), BGR, or of an empty one; for the box see `box_of`."""
     if image is not None:
         axes.imshow(image[..., ::-1])
     axes.set(xlim=box[:2], ylim=box[2:], aspect='equal', xticks=[], yticks=[])
@@ -103,8 +103,8 @@ def box_of(pixels: Array, margin: float = 0.1) -> tuple[float, float, float, flo
     """Left, right, bottom, top of a part of an image around points (..., 2), px.
 
     Args:
-        pixels: unknown ones are NaN.
-        margin: on every side, of the height.
+        pixels: image points, px; unknown ones are NaN.
+        margin: margin on every side, relative to the height.
     """
     flat = pixels.reshape(-1, 2)
     flat = flat[np.isfinite(flat).all(1)]

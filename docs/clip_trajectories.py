@@ -1,9 +1,9 @@
-"""What VMS shows of its sequence, on a window of a clip: from the modes of the filter to optima.
+"""A window of a clip for the figures of VMS, from the filter's modes to optima.
 
 The evidence is that of the nodes: modes, posterior weights and ancestry of the likelihood mixtures.
-The motions of the window are found as `smoother_node` finds them, and refined on the images as
-`person_node` does on request (VMS 4 to 7). Of the windows of a clip that one is taken in which two
-motions that are both likely stay apart longest.
+Motions of the window are found as in `smoother_node`, and refined on the images as in `person_node`
+on request (VMS 4 to 7). The chosen window of a clip is the one in which two likely motions differ
+longest.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from hmt_ros.smoothing.motion_smoother import PATHS, SmoothedMotions
 from hmt_ros.smoothing.trajectory_refinement import refine
 from hmt_ros.smoothing.variational_mixture import VariationalMixture, minimise_free_energy
 
-# Images of a window, and the steps from window to window.
+# Number of images in a window, and step from window to window.
 TIMES, STEP = 47, 5
-# Distance of a joint from which on motions are apart, m, and the least weight of a likely one.
+# Minimum distance of a joint between different motions, m; minimum weight of a likely motion.
 APART, LIKELY = 0.2, 0.1
-# Images that likely motions which are not apart count.
+# Added to the number of images in which motions differ, to break ties.
 TIE = 1e-6
-# Joints that are looked at: those of torso and arms.
+# Compared joints: torso and arms.
 UPPER = (
     'neck', 'head', *(f'{side}_{x}' for x in ('shoulder', 'elbow', 'wrist', 'hand')
                       for side in ('left', 'right')),
 )  # fmt: skip
 SHOULDERS = ('left_shoulder', 'right_shoulder')
 DEMONSTRATION, DESK = 'reach', 'desk_1'
-# Of the descent of the free energy.
+# Numbers of samples and iterations of the free-energy descent.
 SAMPLES, ITERATIONS = 16, 15
 
 
@@ -55,18 +55,18 @@ class ClipTrajectories:
     """A window of a clip, smoothed step by step.
 
     Attributes:
-        clip: images.
+        clip: clip of the window.
         truth: (T, J, 3) true joints of the body, see `from_shoulders`; unknown ones are NaN.
-        inputs: what the tracker was given, see `benchmarks.runs`.
-        body: of the person, as the tracker has it at last.
-        modes: T of the filter.
-        smoother: of the node, without resting feet.
-        found: N motions, as the node has them.
-        images: T of them, as observations.
-        optima: M motions, of which the distinct ones are refined on the images.
-        origins: (M,) motion that each comes from.
-        refined: (M,) whether they are refined.
-        pair: two of them that are likely and stay apart longest.
+        inputs: inputs of the tracker, see `benchmarks.runs`.
+        body: body of the person at the end of tracking.
+        modes: the filter's modes in each of T images.
+        smoother: smoother of the node, without resting feet.
+        found: N motions, as in the node.
+        images: the T images, as observations.
+        optima: M motions; distinct ones are refined on the images.
+        origins: (M,) index of the motion from which each optimum was refined.
+        refined: (M,) whether each optimum is refined.
+        pair: indices of the two likely optima that differ longest.
     """
 
     clip: Clip
@@ -90,7 +90,7 @@ class ClipTrajectories:
 
     @property
     def paths(self) -> Array:
-        """Poses (M, T, d) of the modes that the optima come from."""
+        """Poses (M, T, d) of the modes from which the optima were refined."""
         return self.found.evidence.means[self.origins]
 
     def joints(self, poses: Array) -> Array:
@@ -99,12 +99,12 @@ class ClipTrajectories:
 
     @property
     def weights(self) -> list[Array]:
-        """Of the modes (K_t,) given all images."""
+        """Weights (K_t,) of the modes of each image, given all images."""
         return backward_weights([one.link for one in self.modes])
 
     @property
     def paths_through(self) -> Index:
-        """Modes (N, T) that paths go through which are drawn from the chain."""
+        """Mode indices (N, T) of paths drawn from the chain."""
         return drawn_paths([one.link for one in self.modes], PATHS, self.smoother.seed)[0]
 
     def observed(self, poses: Array) -> Array:
@@ -115,16 +115,16 @@ class ClipTrajectories:
         return np.asarray(value.reshape(count, times).sum(1))
 
     def prior(self, count: int) -> TrajectoryPrior:
-        """Of the states of the first images, as that of the refinement."""
+        """Prior of the states of the first images, as in the refinement."""
         of = self.origins[self.refined]
         noise = self.found.liveliness[of].max()
         return self.smoother.dynamics.prior(np.diff(self.seconds[:count]), noise=noise)
 
     def spectrum(self, count: int) -> Array:
-        """Eigenvalues, falling, of the Hessian at the optimum of the first images alone (VMS 7).
+        """Eigenvalues, decreasing, of the Hessian at the optimum of the first images (VMS 7).
 
-        The optimum is the one next to the heaviest of all images; velocities are integrated out.
-        Metres and radians stand beside each other, as in the paper.
+        It is the optimum nearest to the heaviest one for all images; velocities are integrated
+        out. Metres and radians are not scaled, as in the paper.
         """
         start, part = (
             self.optima.states[self.refined][:1, :count],
@@ -156,10 +156,10 @@ class ClipTrajectories:
 
 
 def clip_trajectories(name: str, inputs: str) -> ClipTrajectories:
-    """Motions and optima of the window of a clip in which two likely motions stay apart longest.
+    """Motions and optima of the window of a clip in which two likely motions differ longest.
 
     Raises:
-        ValueError: the clip can not be read, the filter has lost the person.
+        ValueError: the clip can not be read, or the filter has lost the person.
     """
     clip, true, names = read(name)
     body, modes, shown = followed(clip, inputs)
@@ -192,12 +192,12 @@ def clip_trajectories(name: str, inputs: str) -> ClipTrajectories:
 
 
 def read(name: str) -> tuple[Clip, Mapping[int, Array], Sequence[str]]:
-    """The demonstration, or a clip of the development data; with its true joints by stamp, m.
+    """The demonstration, or a clip of the development data, and its true joints by timestamp, m.
 
-    Joints that are not known are NaN; the truth of the clip itself may lack them.
+    Unknown joints are NaN; the truth in the clip itself may omit them.
 
     Raises:
-        ValueError: files that can not be read.
+        ValueError: a file can not be read.
     """
     folder = ROOT / 'bags' / name if name == DEMONSTRATION else development_folder() / name
     if name != DESK:
@@ -248,10 +248,10 @@ def joints_of(body: Body, poses: Array) -> Array:
 
 
 def traced(body: Body, optima: Array, motions: Array) -> tuple[Mask, Index]:
-    """Whether optima (M, T, d) are refined, and the motion of (N, T, d) that each comes from, (M,).
+    """Whether optima (M, T, d) are refined, and the source (M,) of each among motions (N, T, d).
 
-    It is the same motion or, if they are refined, the nearest of those that are not among the
-    optima.
+    The source is the same motion or, for a refined optimum, the nearest motion that is not itself
+    an optimum.
     """
     away = np.linalg.norm(joints_of(body, optima)[:, None] - joints_of(body, motions), axis=-1)
     away = away.mean((2, 3))
@@ -263,27 +263,27 @@ def traced(body: Body, optima: Array, motions: Array) -> tuple[Mask, Index]:
 def from_shoulders(joints: Array, names: Sequence[str]) -> Array:
     """Joints (..., J, 3), camera frame, relative to the middle of the shoulders, m.
 
-    All clips know where these are.
+    All clips have the shoulders in their truth.
     """
     middle = joints[..., [names.index(name) for name in SHOULDERS], :].mean(-2, keepdims=True)
     return joints - middle
 
 
 def upper_distances(body: Body, poses: Array) -> Array:
-    """Distances (M, M, T, J) of the joints `UPPER` of poses (M, T, d), seen from the pelvis, m."""
+    """Distances (M, M, T, J) of joints `UPPER` from the pelvis between poses (M, T, d), m."""
     joints = joints_of(body, poses)
     joints = joints[:, :, [body.joint_names.index(name) for name in UPPER]] - joints[:, :, :1]
     return np.asarray(np.linalg.norm(joints[:, None] - joints, axis=-1))
 
 
 def apart(body: Body, weights: Array, poses: Array) -> tuple[tuple[int, int], float]:
-    """The two motions that stay apart longest, the heavier first, and their score.
+    """The two motions that differ longest, the heavier first, and their score.
 
-    That is the number of images times the smaller weight, and of motions that are not both likely
-    next to nothing.
+    The score is the number of images times the smaller weight, and almost 0 unless both motions
+    are likely.
 
     Args:
-        weights: (M,) falling; 0: not to be chosen.
+        weights: (M,) decreasing weights; a motion with weight 0 is not chosen.
         poses: (M, T, d).
     """
     images = (upper_distances(body, poses).max(3) > APART).sum(2)

@@ -1,8 +1,8 @@
-"""The picture and the animation of README, from the bag that `make demo` writes.
+"""Draws the picture and the animation of README, from the bag that `make demo` writes.
 
     python docs/figures_demonstration.py
 
-The picture shows the moment when the hand, raised towards the camera, may also be behind the body.
+The picture shows a moment when the hand, raised towards the camera, may also be behind the body.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from msg_tools.messages.images import decode_image
 
 ROOT = Path(__file__).resolve().parents[1]
 BAG, TRACKED = ROOT / 'bags' / 'living_room', ROOT / 'build' / 'demo' / 'living_room'
-MOMENT, AFTER = 1.4, 1.9  # s
+MOMENT, AFTER = 1.4, 1.9  # times of the two images, s
 WRIST, BODY = 'right_wrist', 'neck'
-FIRST, LAST = 0.8, 6.0  # s, of the animation
-SIDE = 260  # px, width of the view from the side in it
+FIRST, LAST = 0.8, 6.0  # start and end of the animation, s
+SIDE = 260  # width of the side view in the animation, px
 GREY = '#cccccc'
 
 
 def main() -> int:
-    """Draws both."""
+    """Draws the picture and the animation."""
     if not TRACKED.is_dir():
         sys.stderr.write(f'{TRACKED} is not there: run "make demo" first\n')
         return 1
@@ -49,7 +49,7 @@ def main() -> int:
 
 
 def read_images() -> dict[int, Array]:
-    """The images (H, W, 3), BGR, by stamp."""
+    """The images (H, W, 3), BGR, by timestamp."""
     with BagReader(BAG) as bag:
         return {
             time_ns(x.message.header.stamp): decode_image(x.message)
@@ -58,12 +58,12 @@ def read_images() -> dict[int, Array]:
 
 
 def nearest(stamps: Any, seconds: float) -> int:
-    """The stamp nearest to a time after the start."""
+    """The timestamp nearest to a time after the start."""
     return min(stamps, key=lambda stamp: abs(stamp - START_NS - seconds * 1e9))
 
 
 def draw_picture(layers: dict[Any, Layer[Moment]], images: dict[int, Array], truth: Any) -> None:
-    """`docs/overview.png`."""
+    """Draws `docs/overview.png`."""
     figure, axes = plt.subplots(
         1,
         5,
@@ -92,14 +92,14 @@ def draw_picture(layers: dict[Any, Layer[Moment]], images: dict[int, Array], tru
 
 
 def show_image(axes: Axes, image: Array, title: str) -> None:
-    """The person in an image."""
+    """Shows the part of an image with the person."""
     axes.imshow(image[40:340, 235:395, ::-1])
     axes.set_title(title)
     axes.set_axis_off()
 
 
 def show_side(axes: Axes, names: tuple[str, ...], joints: Array, truth: Any, stamp: int) -> None:
-    """A pose and, wide and grey, the true one, pelvis on pelvis; the camera is to the right."""
+    """Draws a pose over the true one (wide, grey), aligned at the pelvis; camera on the right."""
     true = truth.joints[stamp]
     for own, which, colour, width in (
         (truth.joint_names, true, GREY, 7.0),
@@ -114,7 +114,7 @@ def show_side(axes: Axes, names: tuple[str, ...], joints: Array, truth: Any, sta
 
 
 def draw_animation(layers: dict[Any, Layer[Moment]], images: dict[int, Array]) -> None:
-    """`docs/overview.webp`: the images, and all modes from the side, darker where likelier."""
+    """Draws `docs/overview.webp`: images, and all modes from the side, likelier ones darker."""
     layer, frames = layers['posterior'], []
     for stamp in sorted(images):
         if not FIRST <= (stamp - START_NS) * 1e-9 <= LAST or stamp not in layer.mixtures:

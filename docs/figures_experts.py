@@ -2,7 +2,7 @@
 
 python docs/figures_experts.py     minutes
 
-All but the toy need the motion capture, and the real person a detector and the development clips.
+All except the toy need the motion capture; the real person also needs a detector and the clips.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ from msg_tools.messages.images import decode_image  # noqa: E402
 EXPERTS = 5
 COLOURS = ('#c8553d', '#1f3a5f', '#e0a458', '#588157', '#7b5e9a')
 GREY = '#b8c4cf'
-LIGHTEST = 0.02  # weight below which a branch is not drawn
+LIGHTEST = 0.02  # minimum weight of a drawn branch
 
-# Motions to learn from and silhouettes of them, for the figures on ambiguity.
+# Training motions, and number of silhouettes, for the figures on ambiguity.
 LEARNED = (
     'cmu_02_01_walk',
     'cmu_02_03_run',
@@ -65,7 +65,7 @@ LEARNED = (
     'cmu_10_01_kick',
 )
 SILHOUETTES = 2500
-# Motions of people left out: name, heading, degrees, and frames a second between pictures.
+# Motions of people outside the training data: name, and heading, degrees.
 STRIPS = {
     'walk': ('cmu_06_01_walk', 70.0),
     'run': ('cmu_run_c', 70.0),
@@ -113,7 +113,7 @@ def _path(mocap: Path, name: str) -> Path:
 
 
 def draw_ambiguity(body: Body, mocap: Path) -> None:
-    """Affinities (fig. 7) and numbers of clusters (fig. 6)."""
+    """Draws affinities (fig. 7) and numbers of clusters (fig. 6)."""
     motions = [recorded_sequence(_path(mocap, name), body) for name in LEARNED]
     pairs = training_set(body, motions, TrainingSettings(samples=SILHOUETTES))
     with tempfile.TemporaryDirectory() as made:
@@ -128,7 +128,7 @@ def draw_ambiguity(body: Body, mocap: Path) -> None:
 def _predicted(
     predictor: PosePredictor, masks: np.ndarray, poses: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of each silhouette poses (K, d), weights (K,) and errors (K,), mm, heaviest first."""
+    """Predicted poses (K, d), weights (K,) and errors (K,), mm, of silhouettes, heaviest first."""
     body, parts = predictor.body, predictor.descriptor
     scored, pelvis = (body.skeleton.joint_index(x) for x in (EVALUATED_JOINTS, (ORIGIN,)))
     rows = parts.describe([silhouette_parts(mask, parts.points) for mask in masks])
@@ -143,7 +143,7 @@ def _predicted(
 
 
 def draw_strip(predictor: PosePredictor, motion: PoseSequence, heading: float, path: Path) -> None:
-    """Silhouettes, true poses, heaviest and best of five, of a person left out (fig. 8 to 10)."""
+    """Draws silhouettes, true poses, heaviest and best predictions (fig. 8 to 10)."""
     frames = np.linspace(0, len(motion.poses) - 1, PICTURES).astype(int)
     poses, masks = seen_from(predictor.body, motion, heading, boundary_noise=1.0)
     poses, masks = poses[frames], masks[frames]
@@ -172,7 +172,7 @@ def draw_strip(predictor: PosePredictor, motion: PoseSequence, heading: float, p
 
 
 def draw_angles(predictor: PosePredictor, motion: PoseSequence, heading: float) -> None:
-    """Angles over time: truth, and all modes by their weights (fig. 11)."""
+    """Draws angles over time: truth, and all modes by their weights (fig. 11)."""
     poses, masks = seen_from(predictor.body, motion, heading, boundary_noise=1.0)
     found = _predicted(predictor, masks, poses)
     figure, axes = plt.subplots(
@@ -192,7 +192,7 @@ def draw_angles(predictor: PosePredictor, motion: PoseSequence, heading: float) 
 
 
 def draw_real(predictor: PosePredictor, folder: Path) -> None:
-    """A detector's masks of a real person, and the two heaviest poses (fig. 16)."""
+    """Draws a detector's masks of a real person, and the two heaviest poses (fig. 16)."""
     info, messages = read_messages(folder)
     images = [decode_image(message) for message in messages]
     camera = camera_from_info(info, images[0].shape[1::-1])
@@ -220,12 +220,12 @@ def draw_real(predictor: PosePredictor, folder: Path) -> None:
 
 
 def _cut(mask: np.ndarray) -> bool:
-    """Whether the border cuts the person."""
+    """Whether the image border cuts the person."""
     return bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
 
 
 def draw_toy() -> None:
-    """The toy: a mixture follows all branches."""
+    """Draws the toy problem, in which a mixture follows all branches."""
     plt.rcParams.update({'font.size': 8, 'axes.spines.top': False, 'axes.spines.right': False})
     inputs, targets = toy(250, 0)
     models: dict[str, ConditionalDensity] = {
@@ -253,7 +253,7 @@ def draw_toy() -> None:
 
 
 def draw(branches: Axes, gates: Axes, at: np.ndarray, model: ConditionalDensity) -> None:
-    """Draws means and standard deviations of experts with weight, and the weights."""
+    """Draws means and standard deviations of experts above LIGHTEST, and all weights."""
     weights, means, covariances = model.predict_arrays(at)
     deviations = np.sqrt(covariances[..., 0, 0])
     for i in range(weights.shape[1]):

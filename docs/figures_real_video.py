@@ -1,10 +1,10 @@
-"""Draws the figures of real_video.md: real clips with a detector's keypoints, as KJS figure 7.
+"""Draws the figures of real_video.md: real clips with a detector's keypoints, like KJS figure 7.
 
 python docs/figures_real_video.py                   minutes for each clip
 python docs/figures_real_video.py leaflet -b bags   keeps the bags in the folder, and uses them
 python docs/figures_real_video.py -b bags -l look   also draws over the images, to look at
 
-The figures show stick figures on white and nothing of the clips.
+The figures show stick figures on white, without images of the clips.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ from msg_tools.messages.headers import time_ns  # noqa: E402
 from msg_tools.messages.images import decode_image  # noqa: E402
 from msg_tools.messages.pose_mixtures import pose_mixture_of  # noqa: E402
 
-# Clips, and the last second of each that is tracked.
+# Clips, and the end of the tracked part of each, s.
 CLIPS = {'park_walk': 4.4, 'leaflet': 20.0}
 COLUMNS = 8
 TOPIC = 'pose_mixture'
 DARK, ACCENT = '#1f3a5f', '#c8553d'
-# Modes that are less probable are not drawn.
+# Minimum probability of a drawn mode.
 FAINTEST = 0.02
 # Dimensions of the position of the root in a pose.
 ROOT = ('root_tx', 'root_ty', 'root_tz')
@@ -54,12 +54,12 @@ ROOT = ('root_tx', 'root_ty', 'root_tz')
 
 @dataclass(frozen=True, eq=False)
 class Path3D:
-    """Where the root of the heaviest mode is.
+    """Path of the root of the heaviest mode.
 
     Attributes:
-        stamps: (T,) ns.
-        positions: (T, 3) camera frame, m.
-        covariances: (T, 3, 3) of the whole mixture, m^2.
+        stamps: (T,) timestamps, ns.
+        positions: (T, 3) positions, camera frame, m.
+        covariances: (T, 3, 3) covariances over the whole mixture, m^2.
         up: (3,) unit vector against gravity, camera frame.
     """
 
@@ -70,7 +70,7 @@ class Path3D:
 
     @property
     def from_above(self) -> np.ndarray:
-        """Rows (2, 3): to the right and away from the camera, in the plane of the floor."""
+        """Axes (2, 3) in the plane of the floor: to the right, and away from the camera."""
         away = np.array([0.0, 0.0, 1.0])
         away -= (away @ self.up) * self.up
         away /= np.linalg.norm(away)
@@ -78,7 +78,7 @@ class Path3D:
 
 
 def main() -> int:
-    """Draws a figure of each clip; 0 also if the clips are absent."""
+    """Draws a figure of each clip; returns 0 also if clips are missing."""
     parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
     parser.add_argument('names', nargs='*', metavar='NAME', help='clips; default: all')
     parser.add_argument('-b', '--bags', type=Path, metavar='DIR', help='folder that keeps the bags')
@@ -110,7 +110,7 @@ def track(clip: Path, bag: Path, end: float) -> None:
     """Imports a clip with its keypoints and tracks it, without a subject file.
 
     Raises:
-        RuntimeError: a command failed; it has said why.
+        RuntimeError: a command failed and has printed the reason.
     """
     info, messages = read_messages(clip)
     frames = bag / 'frames'
@@ -130,7 +130,7 @@ def track(clip: Path, bag: Path, end: float) -> None:
 
 
 def read_track(bag: Path) -> tuple[list[Moment], Path3D, Camera, tuple[str, ...]]:
-    """Mixtures, path of the root, camera and names of joints of what `track` wrote.
+    """Mixtures, root path, camera and joint names, from the bags that `track` wrote.
 
     Raises:
         ValueError: nobody was tracked.
@@ -168,7 +168,7 @@ def read_track(bag: Path) -> tuple[list[Moment], Path3D, Camera, tuple[str, ...]
 
 
 def summary(path: Path3D) -> str:
-    """What the page tells of a path."""
+    """Numbers of a path for the page."""
     seen = path.positions @ path.from_above.T
     times = (path.stamps - path.stamps[0]) * 1e-9
     length = np.linalg.norm(np.diff(seen, axis=0), axis=1).sum()
@@ -185,7 +185,7 @@ def summary(path: Path3D) -> str:
 def draw(
     file: Path, moments: list[Moment], path: Path3D, camera: Camera, names: tuple[str, ...]
 ) -> None:
-    """Film strip from the camera and from above, and the path of the root from above."""
+    """Draws a film strip from the camera and from above, and the root path from above."""
     chosen = np.unique(np.rint(np.linspace(0, len(moments) - 1, COLUMNS)).astype(int))
     with plt.rc_context(STYLE):
         figure = plt.figure(figsize=(9.6, 6.6), layout='constrained')
@@ -204,13 +204,13 @@ def draw(
                 above.set_ylabel('from the camera')
                 below.set_ylabel('from above')
         draw_path(figure.add_subplot(grid[2, :]), path, chosen)
-        # Without the date and versions, so that the same figure is the same file.
+        # Without date and versions, so that equal figures give equal files.
         figure.savefig(file, dpi=100, metadata={'Software': None})
         plt.close(figure)
 
 
 def add_modes(axes: Axes, moment: Moment, points: np.ndarray, names: tuple[str, ...]) -> None:
-    """Stick figures (K, J, 2); the heaviest mode is solid, the others are the paler the lighter."""
+    """Draws stick figures (K, J, 2); the heaviest mode is solid, lighter ones are paler."""
     for rank in reversed(range(len(points))):
         weight = float(moment.weights[rank])
         if rank and weight < FAINTEST:
@@ -228,7 +228,7 @@ def add_modes(axes: Axes, moment: Moment, points: np.ndarray, names: tuple[str, 
 
 
 def frame(axes: Axes, points: np.ndarray, *, upside_down: bool) -> None:
-    """A square around points that hides nothing of them."""
+    """Sets the axes to a square that contains all points."""
     points = points.reshape(-1, 2)
     points = points[np.isfinite(points).all(1)]
     middle, half = (points.min(0) + points.max(0)) / 2, 0.62 * np.ptp(points, axis=0).max()
@@ -238,7 +238,7 @@ def frame(axes: Axes, points: np.ndarray, *, upside_down: bool) -> None:
 
 
 def draw_path(axes: Axes, path: Path3D, chosen: np.ndarray) -> None:
-    """The root from above, with ellipses of one standard deviation at the times of the strip."""
+    """Draws the root from above, with one-sigma ellipses at the times of the strip."""
     turn = path.from_above
     seen = path.positions @ turn.T
     axes.plot(*seen.T, '.-', color=DARK, ms=2.5, lw=0.9)
@@ -255,7 +255,7 @@ def draw_path(axes: Axes, path: Path3D, chosen: np.ndarray) -> None:
 
 
 def look(file: Path, bag: Path, camera: Camera) -> None:
-    """The heaviest modes on the images; such a picture shows the clip and is not for the page."""
+    """Draws the heaviest modes on the images, only for inspection because it shows the clip."""
     (layer,) = (x for x in read_mixtures(bag / 'tracked').layers if x.topic.endswith(TOPIC))
     wanted = {*layer.spread(COLUMNS)}
     images = {}

@@ -1,8 +1,8 @@
-"""Draws the figures of sampling.md: flips, where minima are found, and a dance.
+"""Draws the figures of sampling.md: flips, distances of minima, and a dance.
 
 python docs/figures_sampling.py     minutes
 
-All but the distances need the development data.
+All figures except the distances need the development data.
 """
 
 from __future__ import annotations
@@ -50,18 +50,18 @@ SHOWN = {
 SAMPLES, MINIMA, DARK = '#b8c4cf', '#c8553d', '#1f3a5f'
 FARTHEST = (5.0, 320.0)
 BINS = 32
-# A dance, as in the paper, for the strip; clips whose poses are jumped from; of each so many.
+# Clip of a dance for the strip, as in the paper; clips for the jumps, and poses of each.
 DANCE, COLUMNS = 'charleston', 8
 JUMPED, POSES = ('walk', 'signals', 'laugh'), 12
 JUMPS, SCALE = 'both arms, left calf', 4.0
 FLIPPED = 'signals'
 ARMS = ('right_arm', 'left_arm')
-# Leaves nearer than this are one, m.
+# Minimum distance of distinct leaves, m.
 SAME = 1e-3
 
 
 def main() -> int:
-    """Draws all figures whose data are there."""
+    """Draws all figures whose data are available."""
     plt.switch_backend('Agg')
     with plt.rc_context(PAGE_STYLE):
         draw_distances()
@@ -79,7 +79,7 @@ def main() -> int:
 
 
 def draw_distances() -> None:
-    """How far from the start minima are found (KJS 6)."""
+    """Draws the distances of minima from the start (KJS 6)."""
     body = load_body('human34')
     setting = kjs.setting_of(body, kjs.chosen_pose(body))
     figure, axes = plt.subplots(
@@ -117,7 +117,7 @@ def draw_distances() -> None:
 
 
 def draw_flips(seen: Sequence[Seen]) -> None:
-    """The joints of an arm (KJS 3), and its interpretation tree at a tracked pose (KJS 2)."""
+    """Draws the joints of an arm (KJS 3), and its interpretation tree at a tracked pose (KJS 2)."""
     body, pose, chain = max(
         ((x.body, heaviest(x), chain) for x in seen for chain in ARMS), key=telling
     )
@@ -159,7 +159,7 @@ def heaviest(one: Seen) -> np.ndarray:
 
 
 def telling(arm: tuple[Body, np.ndarray, str]) -> float:
-    """How well an arm shows its tree: some leaves are beyond limits, others not, none is hidden."""
+    """Score of an arm as an example: leaves within and beyond the limits, all visible."""
     reached, pruned = leaves(*arm)
     if len(reached) < 3 or len(pruned) == 0:
         return 0.0
@@ -169,7 +169,7 @@ def telling(arm: tuple[Body, np.ndarray, str]) -> float:
 
 
 def leaves(body: Body, pose: np.ndarray, chain: str) -> tuple[np.ndarray, np.ndarray]:
-    """Joints (L, K + 1, 3) of a chain of K links with the same image, and those beyond limits.
+    """Joints (L, K + 1, 3) of all poses of a K-link chain with one image, and poses beyond limits.
 
     The first leaf is the given pose.
     """
@@ -194,7 +194,7 @@ def leaves(body: Body, pose: np.ndarray, chain: str) -> tuple[np.ndarray, np.nda
 
 
 def draw_limb(axes: Axes, body: Body, chain: str) -> None:
-    """A limb with the axes of its joints, half bent, seen askew (KJS 3)."""
+    """Draws a half-bent limb with the axes of its joints, in an oblique view (KJS 3)."""
     skeleton = body.skeleton
     pose = np.zeros(body.dimension)
     names = [name for name in skeleton.dof_names if name.endswith('elbow')]
@@ -218,14 +218,14 @@ def draw_limb(axes: Axes, body: Body, chain: str) -> None:
         axes.text(point[0] + 0.04, point[1], title, va='center')
     axes.set(title='a limb and its angles', xticks=[], yticks=[])
     axes.set_aspect('equal', adjustable='datalim')
-    # Nothing is drawn here, but the picture reaches as far.
+    # Invisible points that extend the picture.
     axes.plot([-0.3, 0.35], [-0.55, 0.22], alpha=0.0)
     for spine in axes.spines.values():
         spine.set_visible(False)
 
 
 def limb_axes(joints: np.ndarray) -> np.ndarray:
-    """Rows (3, 3): of a limb its bending axis, forwards, and up along its first link."""
+    """Axes (3, 3) of a limb in rows: bending axis, forwards, and up along its first link."""
     up = joints[0] - joints[1]
     up /= np.linalg.norm(up)
     across = np.cross(up, joints[2] - joints[1])
@@ -237,7 +237,7 @@ def limb_axes(joints: np.ndarray) -> np.ndarray:
 
 
 def draw_jumps(seen: dict[str, Sequence[Seen]]) -> None:
-    """Minima that jumps and CSS find at the poses of tracks, and raw costs (as KJS, table 1)."""
+    """Draws minima found by jumps and CSS at tracked poses, and raw costs (as KJS, table 1)."""
     figure, axes = plt.subplots(1, 3, figsize=(8.4, 3.2), dpi=110, layout='constrained')
     styles = zip(seen.items(), ((DARK, 'o'), (MINIMA, 's'), ('#6b8f71', '^')), strict=True)
     rows = []
@@ -275,7 +275,7 @@ def draw_jumps(seen: dict[str, Sequence[Seen]]) -> None:
 
 
 def jumps_at(one: Seen, seed: int) -> tuple[float, ...]:
-    """At the heaviest mode of an image, of jumps and of as many samples of CSS.
+    """Compares jumps with as many samples of CSS at the heaviest mode of an image.
 
     Returns:
         Number of leaves, distinct minima of jumps and of CSS that explain the image as well, and
@@ -301,12 +301,12 @@ def jumps_at(one: Seen, seed: int) -> tuple[float, ...]:
 
 
 def draw_strip(clip: Clip, seen: Sequence[Seen]) -> None:
-    """The truth, the heaviest mode in the image, and from above (KJS 7)."""
+    """Draws the truth and the heaviest mode in the image, and both from above (KJS 7)."""
     rows = np.linspace(0, len(seen) - 1, COLUMNS).astype(int)
     names = clip.truth.joint_names
     pixels = np.array([clip.pixels[seen[i].stamp] for i in rows])
     boxes = np.array([box_of(x, 0.2) for x in pixels])
-    # All on one scale.
+    # All images have the same scale.
     middle = boxes.reshape(-1, 2, 2).mean(2, keepdims=True)
     half = 0.5 * np.diff(boxes.reshape(-1, 2, 2), axis=2)
     half = np.where(half > 0, half.max(0), half.min(0))
@@ -349,7 +349,7 @@ def error_of(one: Seen, clip: Clip) -> float:
 
 
 def save(figure: plt.Figure, name: str) -> None:
-    """Without date and versions, so that the same figure is the same file."""
+    """Saves without date and versions, so that equal figures give equal files."""
     save_picture(figure, DOCS / name)
     plt.close(figure)
 

@@ -1,8 +1,8 @@
-"""Draws the figures of smoothing.md: what VMS shows of its sequence, on clips that are tracked.
+"""Draws the figures of smoothing.md: those of VMS, for tracked clips.
 
 python docs/figures_smoothing.py     two minutes
 
-Those of the clips need the development data; that of bags/reach does not.
+The figures of the clips need the development data; that of bags/reach does not.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from benchmarks.clips import with_file  # noqa: E402
 from benchmarks.runs import BOTH, IMAGES, KEYPOINTS  # noqa: E402
 from hmt_ros.app.report.skeletons import save_picture  # noqa: E402
 
-# Clips of the development data, and what the tracker is given of each.
+# Clips of the development data, and the inputs of the tracker for each.
 CLIPS = {'exercise': BOTH, 'laugh': IMAGES, DESK: KEYPOINTS}
 LINES = {
     'exercise': ('#1f3a5f', '-'),
@@ -53,23 +53,23 @@ LINES = {
     DESK: ('#6b8f71', ':'),
     DEMONSTRATION: ('#8a6fb0', '-.'),
 }
-# Of those whose images may be shown.
+# File names of the film strips, by clip.
 STRIPS = {'exercise': 'smoothing_strip.png', 'laugh': 'smoothing_optima.png'}
 SPECTRUM = (1, 8, TIMES)
 DARK, LIGHT, ACCENT = '#1f3a5f', '#9db4c8', '#c8553d'
 PAIR = (DARK, ACCENT)
 COLUMNS = 6
-# Share of the paths of a motion that a mode which it visits has.
+# Minimum share of a motion's paths through a mode that it visits.
 WELL = 0.15
-# Half the width of torso and arms from above, m; width of a part of an image at least, of its
-# height.
+# Half the width of torso and arms from above, m; minimum width of a part of an image, relative to
+# its height.
 REACH, LEAST_WIDTH = 0.7, 0.75
-# Of the trajectories that are drawn from the posterior.
+# Number of trajectories sampled from the posterior, and seed.
 DRAWN, SEED = 64, 0
 
 
 def main() -> int:
-    """Draws all figures whose data are there."""
+    """Draws all figures whose data are available."""
     plt.switch_backend('Agg')
     demonstration = clip_trajectories(DEMONSTRATION, IMAGES)
     with plt.rc_context(PAGE_STYLE):
@@ -91,7 +91,7 @@ def main() -> int:
 
 
 def draw_clips(found: Sequence[ClipTrajectories]) -> None:
-    """Modes that are visited, paths against optima, and what trajectories have in numbers."""
+    """Draws visited modes, paths compared with optima, and numbers of trajectories."""
     figure, axes = plt.subplots(len(found), 1, figsize=(8.4, 9.6), dpi=100, layout='constrained')
     for ax, one in zip(axes, found, strict=True):
         draw_network(ax, one)
@@ -142,7 +142,7 @@ def draw_clips(found: Sequence[ClipTrajectories]) -> None:
 
 
 def draw_network(axes: Axes, found: ClipTrajectories) -> None:
-    """All modes of each image by the depth of a joint, those that motions visit filled (VMS 2)."""
+    """Draws the modes of each image by the depth of a joint; visited ones are filled (VMS 2)."""
     names = found.body.joint_names
     away = upper_distances(found.body, found.optima.means)[found.pair].max(0)
     joint = names.index(UPPER[int(away.argmax())])
@@ -184,7 +184,7 @@ def draw_network(axes: Axes, found: ClipTrajectories) -> None:
 
 
 def draw_arm(axes: np.ndarray, found: ClipTrajectories) -> None:
-    """The arm that refinement moves most: its bending, and the depth of its end (VMS 3, 4)."""
+    """Draws bending and end depth of the arm that refinement moves most (VMS 3, 4)."""
     best, names = found.pair[0], found.body.joint_names
     modes, optimum = (found.joints(poses[best]) for poses in (found.paths, found.optima.means))
     arms = [
@@ -205,7 +205,7 @@ def draw_arm(axes: np.ndarray, found: ClipTrajectories) -> None:
 
 
 def bending(joints: np.ndarray) -> np.ndarray:
-    """Angles (T,) at the middle one of three joints (T, 3, 3), degrees; 0: straight."""
+    """Angles (T,) at the middle of three joints (T, 3, 3), degrees; 0 is straight."""
     first, second = joints[:, 1] - joints[:, 0], joints[:, 2] - joints[:, 1]
     cosine = (first * second).sum(1)
     cosine /= np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
@@ -213,7 +213,7 @@ def bending(joints: np.ndarray) -> np.ndarray:
 
 
 def draw_numbers(axes: np.ndarray, found: ClipTrajectories) -> None:
-    """Differences, likelihoods, eigenvalues and free energy of a clip (VMS 5 to 8)."""
+    """Draws differences, likelihoods, eigenvalues and free energy of a clip (VMS 5 to 8)."""
     colour, line = LINES[found.clip.name]
     style: dict[str, Any] = {'color': colour, 'ls': line, 'lw': 1.4, 'label': found.clip.name}
     moved = np.degrees(np.abs(found.optima.means - found.paths).mean((1, 2)))
@@ -243,7 +243,7 @@ def draw_numbers(axes: np.ndarray, found: ClipTrajectories) -> None:
 
 
 def draw_pair(found: ClipTrajectories, file: str) -> None:
-    """Two likely optima that stay apart longest, over images and from above (VMS 9)."""
+    """Draws the two likely optima that differ longest, over images and from above (VMS 9)."""
     pair = [*found.pair]
     weights, logs = found.optima.weights[pair], found.optima.log_joint[pair]
     titles = [f'optimum {name},\n{100 * x:.0f} %' for name, x in zip('AB', weights, strict=True)]
@@ -252,7 +252,7 @@ def draw_pair(found: ClipTrajectories, file: str) -> None:
 
 
 def draw_samples(found: ClipTrajectories) -> None:
-    """The two farthest apart of samples of the posterior (VMS 10)."""
+    """Draws the two posterior samples with the largest distance (VMS 10)."""
     drawn = found.optima.sample(DRAWN, np.random.default_rng(SEED))
     away = upper_distances(found.body, drawn).mean((2, 3))
     both = np.unravel_index(int(np.argmax(away)), away.shape)
@@ -262,7 +262,7 @@ def draw_samples(found: ClipTrajectories) -> None:
 
 
 def spread(images: np.ndarray, shown: int) -> list[int]:
-    """Some of the images, of which the nearest is replaced by one that is to be shown."""
+    """Evenly spaced images; the one nearest to `shown` is replaced by it."""
     chosen = images[np.rint(np.linspace(0, len(images) - 1, COLUMNS)).astype(int)]
     chosen[np.abs(chosen - shown).argmin()] = shown
     return sorted(int(i) for i in chosen)
@@ -271,7 +271,7 @@ def spread(images: np.ndarray, shown: int) -> list[int]:
 def draw_strip(
     found: ClipTrajectories, poses: np.ndarray, titles: Sequence[str], file: str
 ) -> None:
-    """Two trajectories (2, T, d) over images where they are apart; from above with the truth."""
+    """Draws two trajectories (2, T, d) over images in which they differ, and from above."""
     away = upper_distances(found.body, poses)[0, 1]
     between = np.flatnonzero(away.max(1) > APART)
     columns = spread(between, int(away.max(1).argmax()))
@@ -290,11 +290,11 @@ def draw_strip(
         4, len(columns), figsize=(8.4, 1.36 * sum(heights) + 0.3), dpi=90, layout='constrained',
         gridspec_kw={'height_ratios': heights},
     )  # fmt: skip
-    # Images of the development data are not shown; the true joints are where they show the person.
+    # Images of the development data are not published; true joints are drawn instead.
     by_stamp = (
         dict(zip(clip.stamps, clip.images, strict=True)) if clip.name == DEMONSTRATION else {}
     )
-    # Of both and the truth; what is unknown is not drawn.
+    # Joints of both trajectories and the truth; unknown ones are not drawn.
     above = np.array([*found.joints(poses), found.truth])[..., [0, 2]]
     above[:, :, lower] = np.nan
     for column, index in enumerate(columns):
@@ -317,7 +317,7 @@ def draw_strip(
 
 
 def save(figure: plt.Figure, name: str) -> None:
-    """Without date and versions, so that the same figure is the same file."""
+    """Saves without date and versions, so that equal figures give equal files."""
     save_picture(figure, DOCS / name)
     plt.close(figure)
 

@@ -27,7 +27,7 @@ NODES = (
     'hri_node',
     'people_node',
 )
-# When a new value of a parameter takes effect: mark of the parameter, and what the mark says.
+# Mark in the table, and its explanation, by the time at which a new value takes effect.
 _EFFECTS = {
     'at once': ('', ''),
     'next track': ('†', 'with the next track'),
@@ -42,7 +42,7 @@ _WIDTH, _INDENT = 100, '    '
 
 
 def main(argv: list[str]) -> int:
-    """Writes what is named."""
+    """Writes the files for the given names."""
     from benchmarks import BENCHMARKS, PARTS
 
     known = (*NODES, *BENCHMARKS, *PARTS)
@@ -78,7 +78,7 @@ def with_part(page: str, name: str, content: str) -> str:
 
 
 def results(name: str) -> str:
-    """What a benchmark measures now, as a page."""
+    """Runs a benchmark and returns its results as a page."""
     from benchmarks import BENCHMARKS, PARTS, benchmark
 
     module, command, what = PARTS.get(name) or (name, name, BENCHMARKS[name])
@@ -158,7 +158,7 @@ def parameter_file_text(node: str, settings: Any, like: str = '', others: Any = 
 
 
 def parameter_table(node: str) -> str:
-    """The parameters of a node, as it declares them.
+    """The table of the parameters that a node declares.
 
     Parameters that filter_node has with the same default, description and effect are named below
     the table, or only counted for people_node, which has nearly all.

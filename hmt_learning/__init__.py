@@ -1,5 +1,5 @@
 """Learning for hmt_ros: motion files, rendering, training sets, and the commands that learn.
 
-It imports hmt_ros, which never imports it: no robot needs it. It runs from the checkout, with what
-`pip install hmt_ros[learning]` installs.
+It imports hmt_ros, but hmt_ros never imports it, so robots do not need it. It runs from the
+checkout, with the packages of `pip install hmt_ros[learning]`.
 """

@@ -1,4 +1,4 @@
-"""Clips of the development data, where it is there."""
+"""Clips of the development data, where it is available."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""What tests share: a ROS domain of their own, reproducible hypothesis runs, poses, clips."""
+"""Shared parts of tests: their own ROS domain, reproducible hypothesis runs, poses, clips."""
 
 import json
 import os
@@ -23,14 +23,14 @@ from msg_tools.messages.images import decode_image
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# Speed is no property of a result: a busy machine must not fail a test.
+# Tests must not fail on a slow machine.
 settings.register_profile('hmt_ros', deadline=None, derandomize=True)
 settings.load_profile('hmt_ros')
-# Nor must it print lines of progress where a test expects the lines of a command.
+# Progress lines must not appear among the expected lines of a command.
 progress.INTERVAL = 3600.0
 
-# Files of tests that take longest, the longest first. They begin first, so that at the end no
-# process waits for another that has just begun a long one.
+# The slowest test files, slowest first. They are run first, so that at the end no process waits for
+# another that has just begun a slow one.
 LONGEST = (
     'test_workspace.py',
     'app/replay/test_live_node.py',
@@ -55,9 +55,9 @@ _domain_reservation = pytest.StashKey[socket.socket]()
 
 
 def _reserve_ros_domain():
-    """Number of a ROS domain that no other test run on this machine uses, and what reserves it.
+    """Number of a ROS domain unused by other test runs on this machine, and its reservation.
 
-    A domain is taken while port 32768 + domain is bound, as ament's domain_coordinator does it. The
+    A domain is reserved by binding port 32768 + domain, as in ament's domain_coordinator. The
     search starts at a number derived from the path of the checkout.
     """
     start = zlib.crc32(str(Path(__file__).resolve()).encode())
@@ -74,7 +74,7 @@ def _reserve_ros_domain():
 
 
 def pytest_configure(config):
-    # Every process its own, also those of pytest-xdist: in one domain every node sees every other.
+    # Each process has its own domain, also with pytest-xdist, because nodes of a domain connect.
     domain, config.stash[_domain_reservation] = _reserve_ros_domain()
     os.environ['ROS_DOMAIN_ID'] = str(domain)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -99,9 +99,9 @@ def pytest_collection_modifyitems(items):
 
 
 def copy_objects_of_core(build: Path) -> None:
-    """What "make core" has compiled, for the build of a copy of the sources.
+    """Copies the objects compiled by "make core", for the build of a copy of the sources.
 
-    A build keeps the objects of files that have not changed.
+    A build reuses the objects of unchanged files.
     """
     for folder in (ROOT / 'build' / 'hmt_ros' / 'build').glob('temp.*'):
         shutil.copytree(folder, build / folder.name)
@@ -109,14 +109,14 @@ def copy_objects_of_core(build: Path) -> None:
 
 @pytest.fixture(scope='session')
 def mediapipe_pose():
-    """Skips tests that want MediaPipe Pose where it is not installed."""
+    """Skips tests that need MediaPipe Pose if it is not installed."""
     if not (has_runtime() and has_networks()):
         pytest.skip('MediaPipe Pose is not installed: run "make detector"')
 
 
 @pytest.fixture(scope='session')
 def mocap():
-    """Folder of the development motions; tests that want it are skipped where it is absent."""
+    """Folder of the development motions; skips tests that need it if it is missing."""
     root = Path(__file__).resolve().parents[1]
     folder = Path(os.environ.get('HMT_SHARED', root / '..' / 'shared')) / 'mocap'
     if not (folder / 'index.csv').is_file():
@@ -177,7 +177,7 @@ def walk_video(tmp_path_factory):
     for number, pixels in enumerate(truth['pixels']):
         flat: list[float] = []
         for name in schemes()['coco17'].names:
-            # The head has no joint of the eyes, the ears and the nose: the detector misses them.
+            # The body has no joints for eyes, ears and nose, so the detector misses them.
             seen = name in joints
             flat += [*map(float, pixels[joints[name]]), 0.9] if seen else [0.0, 0.0, 0.0]
         results.append({'image_id': number, 'category_id': 1, 'keypoints': flat, 'score': 0.9})

@@ -1,4 +1,4 @@
-"""Files of models as a hostile author writes them: other arrays, a right checksum and answer."""
+"""Model files as by a hostile author: changed arrays with a correct checksum and answer."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def forged(arrays, changes, read=None):
     """The arrays with changes (None: without) and the checksum of these.
 
     Args:
-        read: makes the model from its arrays; if it does, the example has the answer of that model.
+        read: makes the model from its arrays; if possible, the example gets that model's answer.
     """
     result = {name: x for name, x in (arrays | changes).items() if x is not None}
     if read is not None:
-        # If the author can not make it work the file is written all the same.
+        # If the model does not work, the file is written anyway.
         with suppress(Exception), np.errstate(all='ignore'):
             result['example/answer'] = learned_file._answer(read(result), result)
     result['checksum'] = np.array(checksum(result))

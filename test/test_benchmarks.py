@@ -24,11 +24,11 @@ OF_NODES = ('live', 'nodes', 'soak')
     [pytest.param(x, marks=pytest.mark.ros) if x in OF_NODES else x for x in BENCHMARKS],
 )
 def test_every_benchmark_runs(name, capsys):
-    """Where the development data is absent, one that needs it says so."""
+    """If the development data are missing, a benchmark that needs them reports it."""
     code, said = main([name, '--quick', '--json']), capsys.readouterr()
     found = json.loads(said.out) if said.out else None
-    # What a step costs here may be above the table, which is of other machines and clips. DDS keeps
-    # ten results for a flooded reader: beside other tests one may be lost.
+    # The cost of a step may exceed the table, which is for other machines and clips. DDS stores ten
+    # results for a flooded reader, so one may be lost while other tests run.
     late = name == 'soak' and all('is silent: waited' in x for x in faults_in(found))
     assert code == 0 or (code == 1 and (name == 'gate' or late)), found
     if found is not None:
@@ -62,7 +62,7 @@ def clips():
 
 
 def test_oracles_gain_what_they_know(clips, tmp_path, monkeypatch, capsys):
-    """Of a video whose truth lacks joints, and has no hips."""
+    """For a video whose truth lacks joints and has no hips."""
     monkeypatch.setattr(tracking_oracles, 'KEPT', tmp_path)
     words = ['tracking', '--parts', 'oracles', '--quick', '--only', 'desk_1']
     assert main([*words, '--inputs', KEYPOINTS, '--json']) == 0

@@ -42,7 +42,7 @@ def camera(*arguments):
     try:
         told = process.communicate(timeout=120)[1]
     finally:
-        # Its nodes, too: they hold the pipe.
+        # Its nodes are killed, too, because they hold the pipe.
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
     return subprocess.CompletedProcess(command, process.returncode, stderr=told)

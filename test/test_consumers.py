@@ -24,9 +24,9 @@ from msg_tools.messages.pose_mixtures import (
 )
 
 PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'consumers.md'
-# Of a standard deviation of 0.1 m, this is how far one mode is beyond 2 m, and the other before.
+# Distances of the two modes beyond 2 m, in m, and their standard deviation.
 WEIGHTS, AWAY, SIGMA = (0.75, 0.25), (0.1, -0.2), 0.1
-# 0.75 of 16 % and 0.25 of 98 %.
+# 0.75 times 16 % plus 0.25 times 98 %.
 ANSWER = 'right wrist within 2 m: {}%'
 
 
@@ -72,7 +72,7 @@ def test_consumer_in_python(tmp_path):
             executor.spin_once(timeout_sec=0.1)
             if select.select([process.stdout], [], [], 0.0)[0]:
                 break
-        # rclpy.spin misses one SIGTERM of some hundreds.
+        # rclpy.spin misses one SIGTERM in some hundreds.
         process.kill()
         assert process.communicate(timeout=20)[0].splitlines()[0] == ANSWER.format(
             37

@@ -1,4 +1,4 @@
-"""The demonstration on a small rendered bag, and what it draws."""
+"""The demonstration on a small rendered bag, and its pictures."""
 
 import io
 import re
@@ -43,7 +43,7 @@ def source(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def output(source, tmp_path_factory):
-    """The folder that the demonstration fills, its exit code, and what it prints."""
+    """Output folder, exit code and printed text of the demonstration."""
     folder = tmp_path_factory.mktemp('demo')
     printed = io.StringIO()
     with redirect_stdout(printed):
@@ -107,7 +107,7 @@ def test_it_tells_what_came_out(output):
 
 
 def test_a_detector_is_beside_ours(source, tmp_path):
-    """Beside a detector's own 3D, which here is right but for 1 cm of depth at the left knee."""
+    """Compared with a detector's own 3D, here exact except for 1 cm of depth at the left knee."""
     truth, scheme = read_truth(source / 'truth.npz'), schemes()['mediapipe33']
     bag, messages = tmp_path / 'detected', RosbagsMessages()
     with BagReader(source) as old, BagWriter(bag) as new:

@@ -1,4 +1,4 @@
-"""The documentation tells the truth: its code runs, its commands parse, its names exist."""
+"""The documentation is correct: its code runs, its commands parse, its names exist."""
 
 import importlib
 import pkgutil
@@ -90,7 +90,7 @@ def commands(page):
 
 @pytest.fixture
 def workplace(tmp_path, monkeypatch):
-    """A folder in which commands of the documentation find the bags of the repository."""
+    """A working folder with the bags of the repository for commands of the documentation."""
     (tmp_path / 'bags').symlink_to(ROOT / 'bags')
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -148,7 +148,7 @@ def test_commands_are_understood(page):
 
 
 def parse(package, words):
-    """Fails where a command of a package does not know the arguments."""
+    """Fails if a command of a package does not accept the arguments."""
     if words == ['--help']:
         return
     module = importlib.import_module(COMMANDS[package][words[0]][0])
@@ -203,7 +203,7 @@ def test_topics_of_a_node(node):
 
 @pytest.mark.parametrize('page', PAGES, ids=PAGE_IDS)
 def test_modules_exist(page):
-    """Dotted names and paths of the packages lead to a module, a folder or a name in one."""
+    """Dotted names and paths of the packages exist as a module, a folder or a name in one."""
     text = page.read_text('utf-8')
     for name in re.findall(r'`((?:hmt_ros|hmt_learning|msg_tools)(?:\.\w+)+)`', text):
         assert pkgutil.resolve_name(name), name
@@ -226,7 +226,7 @@ def test_page_on_numbers_explains_every_field():
 
 
 def codes(text):
-    """What stands in backticks in a text."""
+    """The parts of a text in backticks."""
     return re.findall(r'`([^`\n]+)`', text)
 
 

@@ -1,4 +1,4 @@
-"""The script that finds phrases which make a reader stumble."""
+"""The script that finds phrases that are hard to read."""
 
 from tools.english import main, stumbling
 

@@ -57,7 +57,7 @@ def test_a_detector_is_a_file_and_a_line(corner, tmp_path, capsys):
     assert session.state.landmarks == 1
     with pytest.raises(ValueError, match=r"detector must be one of .*, saw 'edge'"):
         with_values(KeypointsParameters(), {'detector': 'edge'})
-    # The import of a video, here of two images.
+    # The video import, here of two images.
     for name in ('1.png', '2.png'):
         import_video.cv2.imwrite(str(tmp_path / name), np.zeros((48, 64, 3), np.uint8))
     given = [str(tmp_path), '-o', str(tmp_path / 'bag'), '--fov', '60', '--fps', '10']
@@ -65,13 +65,13 @@ def test_a_detector_is_a_file_and_a_line(corner, tmp_path, capsys):
     with BagReader(tmp_path / 'bag') as bag:
         names = [stored.message.names for stored in bag.messages(['keypoints'])]
     assert names == [['nose'], ['nose']]
-    # Its installation.
+    # The installation of the detector.
     assert app.main(['install-detector', 'corner']) == 0
     assert (corner, capsys.readouterr().out) == (['corner'], 'Corner is installed\n')
 
 
 class Bright:
-    """A background of which whatever is brighter than 200 differs."""
+    """A background model that takes everything brighter than 200 as foreground."""
 
     repeats = 1
 
@@ -149,7 +149,7 @@ print(energy.by_cue(poses, derivatives=False).values[:, 0].tolist())
 
 
 def put(path, changes):
-    """Puts text in place of other text, which a file has once."""
+    """Replaces texts that each occur once in a file."""
     text = path.read_text('utf-8')
     for old, new in changes.items():
         assert text.count(old) == 1, old
@@ -158,7 +158,7 @@ def put(path, changes):
 
 
 def test_a_likelihood_term_is_two_files_and_two_lines(tmp_path):
-    """In a copy of the package, whose core is compiled without optimisation: that is fastest."""
+    """In a copy of the package, with the core compiled without optimisation to save time."""
     for name in ('hmt_ros', 'msg_tools'):
         ignored = shutil.ignore_patterns('__pycache__', '*.so')
         shutil.copytree(ROOT / name, tmp_path / name, ignore=ignored)

@@ -1,6 +1,6 @@
-"""The layouts for Lichtblick and Foxglove: every panel has a topic that is there, and fields of it.
+"""The layouts for Lichtblick and Foxglove: every panel shows a topic and fields that exist.
 
-A panel that names another topic stays empty, without a word.
+A panel that names another topic stays empty without an error.
 """
 
 import json
@@ -20,7 +20,7 @@ __all__ = ['still']
 ROOT = Path(__file__).parent.parent
 LIVE, OF_BAGS, OF_PEOPLE = 'hmt.json', 'hmt_bag.json', 'people.json'
 PERSON_1 = '/humans/bodies/p1'
-# Type of the messages that a panel shows, by the name of the panel.
+# Types of the messages that panels show, by the name of the panel.
 SHOWN = {
     'Image': 'sensor_msgs/msg/CompressedImage',
     'DiagnosticSummary': 'diagnostic_msgs/msg/DiagnosticArray',
@@ -39,7 +39,7 @@ def read(name):
 
 
 def panels(layout):
-    """Panels that the tree of a layout names."""
+    """The panels in the tree of a layout."""
     if isinstance(layout, str):
         return {layout}
     assert layout['direction'] in ('row', 'column')
@@ -47,7 +47,7 @@ def panels(layout):
 
 
 def topics_of(name, settings):
-    """Topics of a panel, with the type that it wants, and the fields that it plots behind it."""
+    """Topics of a panel, each with the type it requires and the fields it plots."""
     kind = name.partition('!')[0]
     if kind == '3D':
         found = dict.fromkeys(settings['topics'], 'visualization_msgs/msg/MarkerArray')
@@ -79,9 +79,9 @@ def check_layout(name, there, frames):
     """Asserts that no panel of a layout stays empty.
 
     Args:
-        name: of the layout.
+        name: name of the layout.
         there: type of each topic that has messages.
-        frames: that exist.
+        frames: coordinate frames that exist.
     """
     layout = read(name)
     assert panels(layout['layout']) == layout['configById'].keys()

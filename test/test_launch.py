@@ -1,7 +1,7 @@
-"""The launch file, the views, and what the nodes do when they are started as it says.
+"""The launch file, the views, and the nodes started as in the launch file.
 
-`launch` and `launch_ros` are not among the wheels. Where they are not installed stand-ins that keep
-what they are given take their place; what is given is then started as launch_ros would.
+`launch` and `launch_ros` are not available as wheels. If they are not installed, stand-ins record
+their arguments; the nodes are then started as launch_ros would.
 """
 
 import re
@@ -37,7 +37,7 @@ REACH = ROOT / 'bags' / 'reach'
 NAMESPACE = '/humans/bodies/p1'
 # The likelihood may have to be compiled first.
 PATIENCE = 180.0  # s
-# Services and topics that rclpy gives every lifecycle node.
+# Services and topics of every lifecycle node in rclpy.
 OF_ALL_NODES = (
     r'/(get_type_description|describe_parameters|get_parameter_types|get_parameters|'
     r'list_parameters|set_parameters|set_parameters_atomically|change_state|get_state|'
@@ -52,7 +52,7 @@ SETTINGS = {
 
 
 class Kept:
-    """Any action or substitution: keeps its arguments."""
+    """Any action or substitution; records its arguments."""
 
     def __init__(self, *arguments, **options):
         self.arguments, self.options = arguments, options
@@ -83,7 +83,7 @@ STAND_INS = {
 
 
 def with_stand_ins(file):
-    """Everything in a launch file, with stand-ins."""
+    """The names in a launch file, executed with stand-ins."""
     with pytest.MonkeyPatch.context() as patch:
         for name, content in STAND_INS.items():
             module = types.ModuleType(name)
@@ -93,7 +93,7 @@ def with_stand_ins(file):
 
 
 def detector(installed):
-    """The usual detector, as if it were installed here, or not."""
+    """Pretends that the default detector is installed, or not."""
     return replace(DETECTORS[USUAL_DETECTOR], is_installed=lambda: installed)
 
 
@@ -110,14 +110,14 @@ def defaults(description):
 
 @pytest.fixture
 def actions(description, tmp_path, monkeypatch):
-    """Makes the options of all actions, by their executable."""
+    """Function that returns the options of all actions, by executable."""
     monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))
 
     def make(**given):
         function = description['generate_launch_description']().arguments[0][-1]
         context = defaults(description)
         assert given.keys() <= context.keys()
-        # One by one, unless a test is about the process of all.
+        # In separate processes, unless a test is about the common process.
         made = function.options['function']({**context, 'one_process': 'false', **given})
         return {one.options.get('executable', 'bag'): one.options for one in made}
 
@@ -125,7 +125,7 @@ def actions(description, tmp_path, monkeypatch):
 
 
 def parameters(options):
-    """What a node is given beside its file in config/."""
+    """Parameters of a node in addition to its file in config/."""
     file, values, *_ = options['parameters']
     assert file == str(ROOT / 'hmt_ros' / 'config' / f'{options["name"]}.yaml')
     return read_parameter_file(values, options['name'])
@@ -139,7 +139,7 @@ def test_three_nodes_in_the_namespace_of_a_person(actions):
         assert options['name'] == name
         assert options['namespace'] == '/humans/bodies/p1'
         assert Path(options['parameters'][0]).is_file()
-        # Every name is a parameter of the node and every value one it can have.
+        # Every name must be a parameter of the node, with a valid value.
         own = parameters(options)
         sim_time = own.pop('use_sim_time')
         assert sim_time is False
@@ -161,7 +161,7 @@ def test_three_nodes_in_the_namespace_of_a_person(actions):
     }
     assert set(made['filter_node']['remappings']) == wanted
     assert set(made['bme_node']['remappings']) == wanted
-    # The filter tells when predictions may be rare; without it they are all there is.
+    # With the filter predictions can be rare; without it they are the only output.
     assert parameters(made['bme_node'])['tracked_interval'] == 0.2
     alone = parameters(actions(nodes='bme_node')['bme_node'])
     assert alone['tracked_interval'] == 0.0
@@ -177,7 +177,7 @@ def test_one_process_for_all(actions, description):
     )  # fmt: skip
     assert list(made) == ['person_node', 'hri_node']
     one, apart = made['person_node'], actions(nodes='bme_node filter_node', keypoints='/pose2d')
-    # Nodes keep the names that parameter files know: a name would be that of all of them.
+    # Nodes keep the names used in parameter files; a name would apply to all of them.
     assert 'name' not in one
     assert one['arguments'] == ['bme_node', 'filter_node']
     assert one['namespace'] == NAMESPACE
@@ -196,7 +196,7 @@ def test_one_process_for_all(actions, description):
     assert one['respawn'] is False
     again = actions(one_process='true', respawn='true')['person_node']
     assert (again['respawn'], again['respawn_delay']) == (True, 1.0)
-    # Several people have a node, and so a process, of their own.
+    # The node for several people has its own process.
     assert list(actions(one_process='true', nodes='people_node')) == ['people_node']
 
 
@@ -251,7 +251,7 @@ def test_rep_155(actions):
     own = parameters(bridge)
     assert own.pop('use_sim_time') is True
     settings = with_values(HriParameters(), own)
-    # All people that there are.
+    # All detected people.
     assert (settings.named, settings.image_transport) == ((), 'compressed')
     elsewhere = parameters(actions(hri='true', namespace='/lab/anna')['hri_node'])
     assert elsewhere['namespaces'] == '/lab/anna'
@@ -301,7 +301,7 @@ def test_arguments(actions, tmp_path):
         'mask/compressed': '/segmented/compressed',
         'depth': '/aligned/image_raw',
     }
-    # What the user's own file says goes before all else.
+    # The user's own file has priority.
     assert tracks['parameters'][-1] == 'own.yaml'
     assert tracks['ros_arguments'] == ['--log-level', 'humans.bodies.anna.filter_node:=debug']
     assert made['bag']['cmd'][:4] == ['ros2', 'bag', 'play', 'walk']
@@ -368,7 +368,7 @@ def test_one_line_from_a_webcam_to_a_person(given, options, nodes, monkeypatch):
     assert handed == {'image': '/camera/image_raw', 'nodes': nodes}
     (source,) = person.arguments
     assert source.arguments == (str(ROOT / 'hmt_ros' / 'launch' / 'hmt.launch.py'),)
-    # Neither file has an argument of the other's name.
+    # No argument has the same name in both files.
     assert not context.keys() & {name for name, _, _ in with_stand_ins(FILE)['ARGUMENTS']}
 
 
@@ -478,13 +478,13 @@ def command(options):
 
 
 class Running:
-    """Nodes in processes of their own, and a node that looks at them.
+    """Nodes in their own processes, and a node that inspects them.
 
     Args:
-        node: that looks.
-        context: of it.
-        processes: by the name of their node.
-        folder: with what they have said.
+        node: inspecting node.
+        context: context of the inspecting node.
+        processes: processes by the name of their node.
+        folder: folder with the output of the processes.
     """
 
     def __init__(self, node, context, processes, folder):
@@ -519,7 +519,7 @@ class Running:
         )
 
     def graph(self, name):
-        """Types by name of what a node publishes, subscribes to and replies to."""
+        """Types, by name, of a node's publishers, subscriptions and services."""
         node = self.node
         return {
             'publish': self._types(node.get_publisher_names_and_types_by_node, name),
@@ -543,12 +543,12 @@ class Running:
 
 
 def policy():
-    """Names that the SROS 2 policy allows, resolved as sros2 does, by node and by what is done."""
+    """Names that the SROS 2 policy allows, resolved as in sros2, by node and action."""
     root = ET.parse(ROOT / 'security' / 'sros2_policy.xml').getroot()
     assert (root.tag, root.attrib) == ('policy', {'version': '0.2.0'})
     result = {}
     *apart, together = root.findall('./enclaves/enclave')
-    # All nodes in one process: the profiles of the enclaves before.
+    # With all nodes in one process the profiles are those of the other enclaves.
     (included,) = together.findall('./profiles/*')
     assert together.attrib['path'] == f'{NAMESPACE}/person_node'
     assert included.tag == '{http://www.w3.org/2001/XInclude}include'
@@ -583,7 +583,7 @@ def policy():
 
 
 def opened(pid):
-    """How many sockets of a process others may connect to or send to, by kind."""
+    """Number of a process's sockets that accept connections or datagrams, by kind."""
     process = Path('/proc') / str(pid)
     links = [str(link.readlink()) for link in (process / 'fd').iterdir()]
     inodes = {link[8:-1] for link in links if link.startswith('socket:[')}
@@ -591,10 +591,10 @@ def opened(pid):
     for kind in ('tcp', 'tcp6', 'udp', 'udp6', 'raw', 'raw6', 'unix'):
         rows = [line.split() for line in (process / 'net' / kind).read_text().splitlines()[1:]]
         if kind == 'unix':
-            # Those with the flag of a socket that accepts connections.
+            # Unix sockets with the flag for accepting connections.
             rows = [row for row in rows if row[6] in inodes and int(row[3], 16) & 0x10000]
         else:
-            # Of TCP those in the state LISTEN.
+            # TCP sockets in the state LISTEN.
             rows = [row for row in rows if row[9] in inodes]
             rows = [row for row in rows if not kind.startswith('tcp') or row[3] == '0A']
         counts[kind] = len(rows)
@@ -603,7 +603,7 @@ def opened(pid):
 
 @pytest.fixture(scope='module')
 def started(description, tmp_path_factory):
-    """The three nodes for the bundled bag, running, and somebody who looks at them."""
+    """The three nodes for the bundled bag, running, with an inspecting node."""
     import rclpy
 
     folder = tmp_path_factory.mktemp('launched')
@@ -618,7 +618,7 @@ def started(description, tmp_path_factory):
     context.update(
         params_file=str(own),
         image_transport='compressed',
-        # What the user's own file says goes before it.
+        # The user's own file has priority over it.
         subject_file='12',
         background_file=str(REACH / 'background.png'),
         one_process='false',
@@ -692,7 +692,7 @@ def test_images_of_the_camera_become_a_person_in_the_namespace(started):
     links = [link.attrib['name'] for link in robot.findall('link')]
     camera = arrived['/tf'].transforms[0].header.frame_id
     assert links[0] == camera
-    # The lines of the scene show which way is up.
+    # The lines of the scene determine the vertical.
     frames = {*links[1:], 'body_p1/camera_upright'}
     assert {t.child_frame_id for t in arrived['/tf'].transforms} == frames
     assert all(link.startswith('body_p1/') for link in links[1:])
@@ -708,13 +708,13 @@ def test_policy_and_page_have_what_the_nodes_do_and_nothing_else(started, name):
     allowed = policy()[name]
     found = started.graph(name)
     assert found.keys() == allowed.keys()
-    # Time is subscribed to when it is simulated, images in one form or the other, and transforms
-    # with gravity_frame.
+    # Time is subscribed to if it is simulated, images in one of two forms, and transforms with
+    # gravity_frame.
     optional = {'/clock', '/camera/image_raw', '/tf', '/tf_static'}
     assert allowed['subscribe'] - optional == set(found['subscribe'])
     assert allowed['publish'] == set(found['publish'])
     assert allowed['reply'] == set(found['reply'])
-    # The page of the node: subscribed, published, services, each with its type.
+    # The page of the node lists subscriptions, publishers and services with their types.
     page = (ROOT / 'docs' / f'{name}.md').read_text('utf-8')
     for heading, key, elsewhere in (
         ('## Subscribed topics', 'subscribe', ()),
@@ -739,7 +739,7 @@ def test_policy_and_page_have_what_the_nodes_do_and_nothing_else(started, name):
 
 @pytest.mark.ros
 def test_nodes_listen_to_nothing_but_dds(started):
-    """No TCP port, no socket file; as many UDP ports as DDS opens for any node."""
+    """No TCP port and no socket file; the same UDP ports as for any node with DDS."""
     program = 'import rclpy, sys; rclpy.init(); n = rclpy.create_node("plain"); print(flush=True)'
     plain = subprocess.Popen(
         [sys.executable, '-c', f'{program}; sys.stdin.read()'],

@@ -1,4 +1,4 @@
-"""The shape of the packages: layers, metadata, and what is installed."""
+"""Structure of the packages: layers, metadata, and installed files."""
 
 import ast
 import os
@@ -24,7 +24,7 @@ from test.conftest import LONGEST, copy_objects_of_core
 ROOT = Path(__file__).resolve().parents[1]
 HMT_MSGS = ROOT / 'msg_tools' / 'hmt_msgs'
 
-# An import points to the right, never to the left.
+# Layers import only layers to their right.
 LAYERS = [
     'hmt_learning',
     'hmt_ros.app',
@@ -65,7 +65,7 @@ def layer_of(module):
 
 @cache
 def imported_names(module):
-    """Full names of the modules that a module's text imports, at its top or anywhere in it."""
+    """Full names of the modules that a module imports, at its top or anywhere."""
     path = MODULES[module]
     package = module if path.name == '__init__.py' else module.rpartition('.')[0]
     names: set[str] = set()
@@ -95,7 +95,7 @@ def test_layers_import_downwards_only():
 
 
 def names_learning(text):
-    """Imports of hmt_learning anywhere in a source, and strings that name its modules."""
+    """Imports of hmt_learning in a source text, and strings that name its modules."""
     found = []
     for node in ast.walk(ast.parse(text)):
         named = []
@@ -104,7 +104,7 @@ def names_learning(text):
         elif isinstance(node, ast.Import):
             named = [alias.name for alias in node.names]
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            # What importlib or a subprocess may be given; a sentence has blanks.
+            # A possible argument of importlib or a subprocess; sentences contain blanks.
             named = [node.value] if ' ' not in node.value.strip() else []
         found += [name for name in named if re.match(r'hmt_learning\b', name)]
     return found
@@ -160,7 +160,7 @@ def test_all_but_the_nodes_imports_without_ros_and_nothing_slow_before_it_is_nee
 
 
 def setup_arguments_of(command, monkeypatch):
-    """What setup.py hands to setuptools for a command."""
+    """Arguments of setuptools in setup.py for a command."""
     arguments: dict[str, Any] = {}
     monkeypatch.setattr(setuptools, 'setup', lambda **given: arguments.update(given))
     monkeypatch.setattr(sys, 'argv', ['setup.py', command])
@@ -171,7 +171,7 @@ def setup_arguments_of(command, monkeypatch):
 
 @pytest.fixture(scope='module')
 def setup_arguments():
-    """What setup.py hands to setuptools."""
+    """Arguments of setuptools in setup.py."""
     with pytest.MonkeyPatch.context() as patch:
         return setup_arguments_of('install', patch)
 
@@ -192,7 +192,7 @@ def test_dependencies_of_package_xml_cover_the_ros_packages_used():
     declared = {element.text for element in root.iter() if element.tag.endswith('depend')}
     imported = {name.split('.')[0] for module in MODULES for name in imported_names(module)}
     used = {name for name in imported if name.endswith(('_msgs', '_interfaces')) or name == 'rclpy'}
-    # hmt_msgs is built by setup.py or, if colcon is told of it, before: see test_workspace.py.
+    # hmt_msgs is built by setup.py or earlier by colcon: see test_workspace.py.
     assert used - {'hmt_msgs'} <= declared
 
 
@@ -204,7 +204,7 @@ def test_package_data_covers_every_data_file(setup_arguments):
                 assert any(fnmatch(name, pattern) for pattern in patterns), name
 
 
-# Data that people made, or that was learned from such; everything else that git tracks is our text.
+# Data made by others or learned from such data; all other tracked files are our own.
 LEARNED = ('hmt_ros/body/models/*', 'hmt_ros/experts/models/*', 'hmt_ros/image/*.yaml')
 
 
@@ -277,7 +277,7 @@ def test_changelog_can_be_released(folder, tmp_path):
     text = (folder / 'CHANGELOG.rst').read_text('utf-8')
     name = xml(folder / 'package.xml').findtext('name')
     assert text.splitlines()[1] == f'Changelog for package {name}'
-    # What catkin_prepare_release does with the section of the changes to come.
+    # Changes made by catkin_prepare_release to the section of forthcoming changes.
     released = text.replace(
         'Forthcoming\n-----------\n', f'{version} (2000-01-01)\n------------------\n'
     )
@@ -303,7 +303,7 @@ def test_a_wheel_has_the_library_and_one_command(tmp_path):
     made = subprocess.run(command, capture_output=True, text=True, check=False)
     assert made.returncode == 0, made.stderr
     (path,) = tmp_path.glob('*.whl')
-    # Into an environment of its own, which sees the requirements but no compiler.
+    # Installs into a new environment, which has the requirements but no compiler.
     venv = tmp_path / 'venv'
     subprocess.run([sys.executable, '-m', 'venv', '--without-pip', venv], check=True)
     alone = {'PATH': str(venv / 'bin')}
@@ -356,7 +356,7 @@ def test_tests_that_begin_first_exist():
 
 
 def test_a_release_is_refused_while_addresses_are_not_public(tmp_path):
-    """In a repository of its own, with the script and what it looks at."""
+    """In a temporary repository with the script and its input files."""
     files = ('package.xml', 'setup.py', 'examples/package.xml', 'msg_tools/hmt_msgs/package.xml')
     for name in (*files, 'tools/release.sh'):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
-"""The lines for `ros2 bag` in the documentation, by the rule by which rosbag2 finds topics.
+"""The `ros2 bag` commands in the documentation, by the rule by which rosbag2 finds topics.
 
-rosbag2 is not among the wheels. Its player expands the names that it is given, as every node does,
+There is no wheel of rosbag2. Its player expands the names that it is given, as every node does,
 and compares them with the names in the bag; overrides of the quality of service and the recorder
 compare them as they are.
 """
@@ -18,26 +18,26 @@ from msg_tools.bags.bag_metadata import absolute_name
 
 ROOT = Path(__file__).parent.parent
 PAGES = ('README.md', 'docs/bags.md', 'docs/views.md')
-# What a bag of replay has; a test of the command compares.
+# The topics in a bag of `replay`; a test of the command compares them.
 REPLAYED = {absolute_name(x) for x in (*track_messages.TOPICS, *smoothed_messages.TOPICS)}
 
 
 def lines(verb):
-    """Words of the commands behind `ros2 bag <verb>` in the documentation."""
+    """Words after `ros2 bag <verb>` in the commands of the documentation."""
     text = '\n'.join((ROOT / page).read_text('utf-8') for page in PAGES)
     found = re.findall(rf'(?:^|`)ros2 bag {verb} ([^`\n]*)', text, re.MULTILINE)
     return [shlex.split(line) for line in found]
 
 
 def arguments(words, option):
-    """What follows an option, up to the next."""
+    """The words after an option, up to the next option."""
     rest = words[words.index(option) + 1 :] if option in words else []
     end = next((i for i, word in enumerate(rest) if word.startswith('-')), len(rest))
     return rest[:end]
 
 
 def recorded(bag):
-    """Names of the topics of a bag, in its metadata and in its file, which must be the same."""
+    """Names of a bag's topics, which must be the same in its metadata and in its file."""
     if bag == 'tracked':
         return REPLAYED
     folder = ROOT / bag
@@ -75,7 +75,7 @@ def test_lines_for_playing_and_recording_are_there():
     assert names
     assert all(name.startswith('/') for name in names)
     (pattern,) = (rule for words in stored for rule in arguments(words, '--regex'))
-    # The recorder searches, the player matches the whole name.
+    # The recorder matches parts of the name, the player the whole name.
     for topic in track_messages.TOPICS.keys() - {'/tf'}:
         assert re.fullmatch(pattern, f'/humans/bodies/p1/{topic}')
     assert not re.search(pattern, '/camera/image_raw')

@@ -1,8 +1,8 @@
 """The same bag gives the same bytes on every processor.
 
-Between image and message nothing may be called whose code is chosen by processor: BLAS and LAPACK,
-the elementary functions of numpy and of the C library, and some functions of OpenCV. The core
-stands for them.
+Between image and message, functions with processor-specific code are not allowed: BLAS and LAPACK,
+elementary functions of numpy and of the C library, and some functions of OpenCV. The core replaces
+them.
 """
 
 import ast
@@ -19,7 +19,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# Modules and folders off the way from image to message, and why.
+# Modules and folders not used between image and message, with reasons.
 EXEMPT = {
     'hmt_ros/app': 'commands: what they compute is read by people',
     'hmt_ros/evaluation': 'scores and figures',
@@ -29,8 +29,8 @@ EXEMPT = {
     'hmt_ros/experts/sparse_bayes.py': 'learning',
     'hmt_ros/experts/training_pairs.py': 'learning',
 }
-# Classes and functions beside the way, in modules that are on it: what learns; what stands for
-# the rest, and a check of covariances, whose factors nobody uses.
+# Exempt classes and functions in other modules: those that learn, and a check of covariances whose
+# factors are not used.
 BESIDE = {
     'hmt_ros/experts/gates.py': {'_Softmax', 'first', 'learned'},
     'hmt_ros/experts/neighbour_models.py': {'fit'},
@@ -47,7 +47,7 @@ OF_NUMPY = ELEMENTARY | {
     *('matmul', 'dot', 'vdot', 'inner', 'tensordot', 'vecdot', 'convolve', 'correlate', 'cov'),
     *('corrcoef', 'polyfit', 'hypot', 'argpartition'),
 }
-# Along an axis numpy adds squares itself.
+# numpy's norm along an axis does not use BLAS.
 OF_LINALG = {'LinAlgError', 'norm'}
 OF_SCIPY = {'scipy.optimize'}  # the assignment of detections only adds and compares
 OF_OPENCV = {'warpAffine', 'warpPerspective', 'warpPolar', 'exp', 'log', 'pow', 'gemm', 'solve'}
@@ -68,7 +68,7 @@ def modules():
 
 
 def is_named_by_processor(name):
-    """Whether a dotted name is of a function whose code is chosen by processor."""
+    """Whether a dotted name is that of a function with processor-specific code."""
     package, _, rest = name.partition('.')
     if not re.fullmatch(r'[\w.]+', rest):
         return False
@@ -79,7 +79,7 @@ def is_named_by_processor(name):
 
 
 def is_called_by_processor(call):
-    """Whether a call's arguments choose code by processor, or leave the order of ties to it."""
+    """Whether a call's arguments select processor-specific code, or an unstable order of ties."""
     name, given = ast.unparse(call.func), {keyword.arg for keyword in call.keywords}
     method = name.rpartition('.')[2]
     return (
@@ -113,7 +113,7 @@ def depends_on_processor(node):
 
 
 def calls_by_processor(source, beside=frozenset()):
-    """Line and text of what depends on the processor, outside of the functions beside the way."""
+    """Line and text of processor-dependent calls, outside exempt functions."""
     found = []
 
     def visit(node):
@@ -189,7 +189,7 @@ def test_the_core_calls_no_elementary_function_of_the_c_library():
     assert found == []
 
 
-# Replays short clips and prints a digest of each topic that filter, predictor and smoother publish.
+# Replays short clips and prints a digest of each topic of filter, predictor and smoother.
 RUN = r"""
 import hashlib, json, sys
 from pathlib import Path
@@ -227,8 +227,8 @@ print(json.dumps({
 }))
 """
 
-# What each switch takes away of a processor's; together they stand for one of 2008. The core looks
-# at the processor itself: `test/core` compares the versions of its functions.
+# Switches that disable processor features; together they emulate a processor of 2008. The core
+# detects the processor itself: `test/core` compares the versions of its functions.
 SWITCHES = {
     'C library': {
         'GLIBC_TUNABLES': 'glibc.cpu.hwcaps=-AVX2,-AVX2_Usable,-FMA,-FMA_Usable,-FMA4,-AVX,-AVX512F'
@@ -241,8 +241,8 @@ SWITCHES = {
         'OPENCV_IPP': 'sse42',
     },
 }
-# Digests of some topics, and the versions that they hold for. To change results on purpose, put
-# here what the test finds.
+# Digests of some topics, and the versions for which they are valid. After an intended change of
+# results, copy the digests from the failed test.
 VERSIONS = {'numpy': '2.4.6', 'cv2': '5.0.0'}
 DIGESTS = {
     'keypoints/pose_mixture': 'eb6dc3232bcfc94d',
@@ -253,7 +253,7 @@ DIGESTS = {
 
 
 def digests_of_run(folder, **switches):
-    """A digest for each topic that the nodes publish on the clips, by clip and topic."""
+    """Digests of the topics published by the nodes for the clips, by clip and topic."""
     folder.mkdir()
     done = subprocess.run(
         [sys.executable, '-c', RUN, str(ROOT / 'bags'), str(folder)],

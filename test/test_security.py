@@ -1,4 +1,4 @@
-"""What comes from outside is data: not executed, not unpickled, not unbounded."""
+"""External input is data: never executed, never unpickled, always bounded."""
 
 import ast
 import re
@@ -26,9 +26,9 @@ FORBIDDEN_MODULES = {
     'http', 'urllib.request', 'requests', 'ftplib', 'smtplib', 'telnetlib', 'xmlrpc',
     'socket', 'socketserver', 'ssl', 'torch',
 }  # fmt: skip
-# Where a module that others may not use is used for something that opens nothing.
+# Allowed uses of forbidden modules, which open no connection.
 ALLOWED = {
-    # Reserves the number of a ROS domain for a replay; nobody is listened to.
+    # Reserves the number of a ROS domain for a replay, without listening.
     ('hmt_ros/app/replay/player.py', 'socket'),
 }
 FORBIDDEN_CALLS = {
@@ -38,7 +38,7 @@ FORBIDDEN_CALLS = {
 
 
 def faults(text, name):
-    """What a source does that it must not do."""
+    """Forbidden actions of a source file."""
     found = []
     for node in ast.walk(ast.parse(text)):
         modules = []

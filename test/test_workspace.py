@@ -1,4 +1,4 @@
-"""The clone as one package among others: in a workspace of colcon, for rosdep, for bloom."""
+"""The clone as one of several packages: in a colcon workspace, for rosdep, for bloom."""
 
 import json
 import os
@@ -44,8 +44,8 @@ def package_xml(name, build_type, depends):
 """
 
 
-# Packages of the same workspace that use the messages, as docs/consumers.md tells them to; one
-# comes before hmt_ros in the alphabet, and one after it.
+# Packages of the same workspace that use the messages as in docs/consumers.md; one is before
+# hmt_ros in the alphabet, and one after it.
 CONSUMERS = {
     'consumer/package.xml': package_xml('consumer', 'ament_cmake', code('xml')),
     'consumer/CMakeLists.txt': code('cmake'),
@@ -71,7 +71,7 @@ install_scripts=$base/lib/listener
 
 
 def ros_without_this_package():
-    """The environment of the tests, without the workspace in which they were built."""
+    """The environment of the tests, without the workspace of their build."""
     environment = dict(os.environ)
     prefixes = [Path(x) for x in os.environ['AMENT_PREFIX_PATH'].split(os.pathsep) if x]
     own = [x for x in prefixes if any((x / 'share' / n).is_dir() for n in ('hmt_ros', 'hmt_msgs'))]
@@ -83,12 +83,12 @@ def ros_without_this_package():
             x for x in folders if x.resolve() == venv or not any(x.is_relative_to(y) for y in own)
         ]
         environment[name] = os.pathsep.join(map(str, kept))
-    # Where wheels keep libraries that their own do not find from a program in C++.
+    # Folders of libraries in wheels, which are not found from a C++ program otherwise.
     libraries = map(str, Path(sysconfig.get_path('purelib')).glob('ros_*.libs'))
     environment['LD_LIBRARY_PATH'] += ''.join(f':{folder}' for folder in sorted(libraries))
     environment.pop('COLCON_PREFIX_PATH', None)
     environment.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None)
-    # Where tools/workspace.sh has unpacked the headers of Python.
+    # Python headers unpacked by tools/workspace.sh.
     headers = Path(sys.prefix, 'python-headers')
     if headers.is_dir():
         include = f'{headers}{sysconfig.get_path("include")}'
@@ -98,7 +98,7 @@ def ros_without_this_package():
 
 
 def write_packages(folder, replace=('', '')):
-    """Writes the packages that use the messages, with a text in place of another."""
+    """Writes the packages that use the messages, with one text replaced."""
     for name, text in CONSUMERS.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text.replace(*replace) if replace[0] else text, 'utf-8')
@@ -120,9 +120,9 @@ def workspace(tmp_path_factory):
     write_packages(folder / 'src')
     copy_objects_of_core(folder / 'build' / 'hmt_ros' / 'build')
     environment = ros_without_this_package()
-    # It comes before an rclcpp that is installed, and answers without a publisher.
+    # The stand-in precedes an installed rclcpp, and answers without a publisher.
     environment['CMAKE_PREFIX_PATH'] = f'{RCLCPP}:{environment["CMAKE_PREFIX_PATH"]}'
-    # The line of the page on the examples.
+    # The command line on the page of the examples.
     page = (EXAMPLES / 'README.md').read_text('utf-8')
     (line,) = re.findall(r'^colcon build .*$', page, re.M)
     done = subprocess.run(
@@ -174,8 +174,8 @@ def test_colcon_build_in_a_workspace_builds_the_messages(workspace):
 def test_packages_that_use_the_messages_run(workspace):
     for package, name in (('consumer', 'consumer'), ('hmt_ros_examples', 'stop_near_hand')):
         ran = sourced(workspace, f'install/{package}/lib/{package}/{name}')
-        # Stops before anything has come, for a hand that may be near, for a lost person, and for
-        # three mixtures that do not tell.
+        # It stops before any message, for a hand that may be near, for a lost person, and for
+        # three mixtures without information on hands.
         assert (ran.returncode, ran.stdout) == (0, '101010111'), ran.stderr
     programs = workspace / 'install' / 'hmt_ros_examples' / 'lib' / 'hmt_ros_examples'
     for path in EXAMPLES.glob('*.py'):
@@ -204,12 +204,12 @@ def test_a_node_of_a_workspace_starts(workspace):
     assert node.returncode == 0
 
 
-# ---- What setup.py does about the messages, without building them ----
+# ---- Messages in setup.py, without building them ----
 
 
 @pytest.fixture
 def install_messages(monkeypatch, tmp_path):
-    """setup.py's functions, its commands of CMake recorded instead of run."""
+    """setup.py's functions; commands of CMake are recorded instead of run."""
     calls: list[tuple[list[str], dict[str, str]]] = []
     codes: list[int] = []
 
@@ -251,12 +251,12 @@ def test_a_failed_build_of_messages_says_what_to_do(install_messages, tmp_path):
     assert len(install_messages.calls) == 1
 
 
-# ---- What tools/workspace.sh does about the detector, with a stand-in for Python ----
+# ---- The detector in tools/workspace.sh, with a stand-in for Python ----
 
 
 @pytest.fixture
 def clone(tmp_path):
-    """What the stage of the detector reads of a clone that is set up, without the packages."""
+    """The files of a clone that the detector stage reads, without the packages."""
     for name in (
         'tools/workspace.sh',
         'requirements/detector.txt',
@@ -269,7 +269,7 @@ def clone(tmp_path):
     stamps.mkdir(parents=True)
     (stamps / 'ros').write_text('as it is\n', 'utf-8')
     python.parent.mkdir()
-    # Keeps its arguments, and fails at what the file "offline" names.
+    # Records its arguments, and fails for those named in the file "offline".
     python.write_text(
         f'#!/bin/bash\necho "$*" >>{tmp_path}/calls\n'
         f'if [ -f {tmp_path}/offline ] && [[ "$*" == *"$(cat {tmp_path}/offline)"* ]]; then\n'
@@ -282,7 +282,7 @@ def clone(tmp_path):
 
 
 def run_detector_stage(clone):
-    """Exit code, lines on stderr but for how long it takes, and calls of Python of one run."""
+    """Exit code, lines on stderr without times, and Python calls of one run."""
     (clone / 'calls').unlink(missing_ok=True)
     done = subprocess.run(
         [clone / 'tools' / 'workspace.sh', 'detector'], capture_output=True, text=True, check=False
@@ -321,18 +321,18 @@ def test_without_network_the_rest_goes_on(clone, what, calls):
         'hmt_ros: MediaPipe Pose could not be installed, all else works without: "make detector" '
         'tries again (ERROR: no route to host)'
     )
-    # Nothing that other stages look at has changed; the next call tries again.
+    # Nothing has changed for other stages; the next call tries again.
     assert sorted(x.name for x in (clone / '.venv' / 'stamps').iterdir()) == ['ros']
     assert not (clone / '.venv' / 'unfinished').exists()
     (clone / 'offline').unlink()
     assert run_detector_stage(clone)[::2] == (0, 2)
 
 
-# ---- What colcon, rosdep and bloom read ----
+# ---- Files for colcon, rosdep and bloom ----
 
 
 def test_rosdep_can_resolve_what_it_finds():
-    """rosdep finds one package here, and knows no package of this repository."""
+    """rosdep finds one package here, and resolves no package of this repository."""
     packages = pytest.importorskip('catkin_pkg.packages')
     found = packages.find_packages(str(ROOT))
     assert [package.name for package in found.values()] == ['hmt_ros']
@@ -341,7 +341,7 @@ def test_rosdep_can_resolve_what_it_finds():
     kinds = ('buildtool', 'build', 'build_export', 'exec', 'test')
     names = {x.name for kind in kinds for x in getattr(package, f'{kind}_depends')}
     assert names.isdisjoint({'hmt_ros', 'hmt_msgs'})
-    # It installs what the messages need too.
+    # It also installs the dependencies of the messages.
     messages = pytest.importorskip('catkin_pkg.package').parse_package(str(HMT_MSGS))
     messages.validate()
     needed = {x.name for kind in kinds for x in getattr(messages, f'{kind}_depends')}
@@ -370,7 +370,7 @@ def test_messages_alone_are_linked_into_a_workspace(tmp_path):
     assert order(folder) == ['hmt_msgs', 'consumer', 'listener']
 
 
-# ---- A file that is not run here: its commands are ----
+# ---- A file that is not run here, but its commands are ----
 
 
 def test_workflow_runs_what_the_project_is_tested_with():

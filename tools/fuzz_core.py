@@ -1,9 +1,9 @@
-"""Spoils the arguments of all functions of the core at random: a result or an error, no crash.
+"""Calls all functions of the core with corrupted arguments: they must return or raise an error.
 
     python tools/fuzz_core.py CALLS [SEED]
 
-Good arguments are those with which the tests of the core call the functions. Prints each call
-before it is made with --verbose, so that the last line says which one crashed.
+Good arguments are recorded from the tests of the core. With --verbose each call is printed before
+it is made, so that the last line shows the one that crashed.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ import pytest
 from hmt_ros import core
 
 TESTS = Path(__file__).parents[1] / 'test'
-KEPT = 8  # calls of each function
+KEPT = 8  # maximum number of recorded calls of each function
 NUMBERS = (np.nan, np.inf, -np.inf, -1.0, 0.0, 1e-300, 1e300, -(2**63), 2**62, 2**31, -1, 3)
 TYPES = (np.float32, np.float64, np.int64, np.int32, np.int8, np.uint8, np.bool_, '>f8', object)
-EXTENTS = (0, 1, 2, 200)  # such as those of bodies
+EXTENTS = (0, 1, 2, 200)  # lengths of axes
 
 
 class Recorder:
-    """Stands for a function of the core, and keeps arguments that it takes."""
+    """Wraps a function of the core, and records arguments of its calls."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = function
@@ -45,7 +45,7 @@ class Recorder:
 
 
 def copied(value: Any) -> Any:
-    """Arguments with memory of their own."""
+    """Arguments with copies of their arrays."""
     return changed(value, lambda x: x.copy() if isinstance(x, np.ndarray) else x)
 
 
@@ -67,7 +67,7 @@ def leaves(value: Any) -> Iterator[Any]:
 
 
 def spoilt(value: Any, rng: np.random.Generator) -> Any:
-    """An array or a number in another way."""
+    """A corrupted array or number."""
     number = NUMBERS[rng.integers(len(NUMBERS))]
     if not isinstance(value, np.ndarray):
         return (number, None, 'text', np.zeros(3))[rng.choice(4, p=[0.85, 0.05, 0.05, 0.05])]
@@ -81,11 +81,11 @@ def spoilt(value: Any, rng: np.random.Generator) -> Any:
             return result
         if way == 3:
             return value.astype(TYPES[rng.integers(len(TYPES))], copy=True)
-        if way == 4:  # of another extent along an axis
+        if way == 4:  # another length of an axis
             shape = [min(x, max(EXTENTS)) for x in value.shape] or [1]
             shape[rng.integers(len(shape))] = EXTENTS[rng.integers(len(EXTENTS))]
             return np.resize(value, shape) if value.size else np.zeros(shape, value.dtype)
-        if way == 5:  # of no numbers, but huge
+        if way == 5:  # an empty array with a huge axis
             shape = [min(x, max(EXTENTS)) for x in value.shape] or [1]
             shape[rng.integers(len(shape))] = 0
             shape[rng.integers(len(shape))] = 0 if len(shape) == 1 else 2**31
@@ -100,7 +100,7 @@ def spoilt(value: Any, rng: np.random.Generator) -> Any:
 
 
 def resized(arguments: tuple[Any, ...], rng: np.random.Generator) -> tuple[Any, ...]:
-    """All axes of one extent at another: such as a body with other segments."""
+    """Arguments with all axes of one length resized, as for a body with other segments."""
     extents = [x for array in leaves(arguments) for x in np.shape(array)]
     if not extents:
         return arguments
@@ -116,7 +116,7 @@ def resized(arguments: tuple[Any, ...], rng: np.random.Generator) -> tuple[Any, 
 
 
 def spoil(arguments: tuple[Any, ...], rng: np.random.Generator) -> tuple[Any, ...]:
-    """Arguments of which a few are spoilt."""
+    """Arguments with a few corrupted values."""
     result: Any = copied(arguments)
     if rng.random() < 0.3:
         result = resized(result, rng)
@@ -132,7 +132,7 @@ def spoil(arguments: tuple[Any, ...], rng: np.random.Generator) -> tuple[Any, ..
 
 
 def recorded() -> dict[str, Recorder]:
-    """The functions of the core with arguments, from its tests."""
+    """The functions of the core, with arguments recorded from its tests."""
     found = {
         name: Recorder(value)
         for name, value in vars(core).items()
@@ -154,7 +154,7 @@ def recorded() -> dict[str, Recorder]:
 
 
 def run(calls: int, seed: int, *, verbose: bool) -> None:
-    """Makes so many calls; an error that names no argument is raised."""
+    """Makes a number of calls; raises errors that do not name an argument."""
     functions = recorded()
     unused = sorted(name for name, x in functions.items() if not x.calls)
     if unused:
@@ -177,7 +177,7 @@ def run(calls: int, seed: int, *, verbose: bool) -> None:
 
 
 def show(line: str) -> None:
-    """Prints a line at once."""
+    """Prints a line and flushes."""
     sys.stdout.write(f'{line}\n')
     sys.stdout.flush()
 

@@ -1,6 +1,6 @@
-"""Nodes and files under load and fault.
+"""Soak test: nodes and files under load and faults.
 
-`cases` lists the cases, runs them and reports; `messages`, `files` and `nodes` do it.
+`cases` lists, runs and reports the cases; `messages`, `files`, `nodes` and `hostile` do the work.
 """
 
 from benchmarks.soak.cases import as_text, main, measure

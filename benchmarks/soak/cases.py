@@ -1,4 +1,4 @@
-"""soak: nodes and files under load and fault; what was done, how often, and what was lost."""
+"""soak: nodes and files under load and faults; actions, their numbers, and losses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from benchmarks.soak.outcome import Amount, Outcome, place
 
 MINUTES = 10.0
 
-# Each case: what does it, how often in full and with --quick, and its share of the time.
+# By case: function, repetitions in full and with --quick, and share of the time.
 CASES: dict[str, tuple[Callable[..., Iterator[Outcome]], int, int, float]] = {
     'hostile': (hostile, 100_000, 1, 0.3),
     'messages': (messages, 100_000, 30, 0.15),
@@ -31,7 +31,7 @@ CASES: dict[str, tuple[Callable[..., Iterator[Outcome]], int, int, float]] = {
 
 
 def main(argv: list[str]) -> int:
-    """Runs the soak; 1 where something was lost or went wrong."""
+    """Runs the soak test; returns 1 if something was lost or went wrong."""
     parser = benchmark_parser('soak', __doc__, quick='each case a few times, with one node')
     add_choice(parser, tuple(CASES), 'CASE')
     text = 'that it may take; what is not done by then is left out (%(default)g)'
@@ -52,7 +52,7 @@ def measure(
     only: tuple[str, ...] = tuple(CASES),
     given: Path | None = None,
 ) -> dict[str, Any]:
-    """What came of the cases."""
+    """Outcomes of the cases."""
     shares = sum(CASES[name][3] for name in only)
 
     def done(name: str) -> list[dict[str, Any]]:
@@ -76,7 +76,7 @@ def result_met(result: dict[str, Any]) -> bool:
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """A table for people."""
+    """Human-readable table."""
     rows = [['of', 'what was done', 'times', 'refused', 'lost', 'memory', 'stays', '']]
     for name in CASES:
         for entry in result.get(name, []):
@@ -88,7 +88,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
 
 
 def _to_its_end(name: str, outcomes: Iterator[Outcome]) -> Iterator[Outcome]:
-    """The outcomes of a stage; its own failure is one of them, and others follow."""
+    """The outcomes of a stage; a failure of the stage itself becomes an outcome, too."""
     try:
         yield from outcomes
     except Exception as error:  # noqa: BLE001

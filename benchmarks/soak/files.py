@@ -1,4 +1,4 @@
-"""The soak of files: random and damaged YAML, model files and pictures into what reads them."""
+"""Soak test of file readers with damaged YAML files, model files and images."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from hmt_ros.sessions.parameter_file import read_parameter_file
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.tracking import read_subject
 
-# What breaks a value of a file of text.
+# Strange values for text files.
 _TEXT = """
 null .nan -.inf 1e999 -1 0 [] {} '' !!python/name:os.system 999999999999999999999 yes % "
 """
@@ -37,11 +37,11 @@ class _Kind:
     """A kind of file.
 
     Attributes:
-        name: of it.
-        suffix: of its name.
-        valid: a good one.
-        damage: makes bad ones of it.
-        read: what a node or a command does with it.
+        name: name of the kind.
+        suffix: suffix of its files.
+        valid: content of a valid file.
+        damage: function that damages the content.
+        read: function of a node or a command that reads the file.
     """
 
     name: str
@@ -52,7 +52,7 @@ class _Kind:
 
 
 def files(amount: Amount, *, quick: bool = False) -> Iterator[Outcome]:
-    """Every kind of file that is read, damaged: it is used, or refused with one line."""
+    """Reads damaged files of every kind; each must be used, or refused with one line."""
     kinds = _kinds()[: 3 if quick else None]
     with TemporaryDirectory(prefix='hmt_ros.') as folder:
         for kind in kinds:
@@ -119,7 +119,7 @@ def _read_damaged(kind: _Kind, folder: Path, amount: Amount) -> Outcome:
 
 
 def _damaged_text(data: bytes, rng: np.random.Generator) -> bytes:
-    """Damaged bytes, or lines that were changed, lost, doubled or exchanged."""
+    """Text with damaged bytes, or with changed, lost, doubled or swapped lines."""
     if rng.random() < 0.3:
         return damaged(data, rng)
     lines = data.decode().split('\n')
@@ -142,7 +142,7 @@ def _damaged_text(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _damaged_arrays(data: bytes, rng: np.random.Generator) -> bytes:
-    """A whole archive with arrays that are missing, of another shape or type, or other numbers."""
+    """A valid archive with arrays that are missing or have other shapes, types or numbers."""
     with np.load(io.BytesIO(data)) as archive:
         arrays = {name: archive[name] for name in archive.files}
     names = sorted(arrays)
@@ -167,7 +167,7 @@ def _damaged_array(values: Any, rng: np.random.Generator) -> Any:
     if kind == 2:
         return np.zeros(0, values.dtype)
     if kind == 3:
-        # All of a large array as text would be a hundred times as large as the model.
+        # A whole large array as text would be a hundred times as large as the model.
         return values.ravel()[:1000].astype('U') if values.dtype.kind != 'U' else np.array(7)
     if values.dtype.kind == 'f' and values.size:
         wrong = np.array(values)

@@ -1,8 +1,8 @@
-"""The soak of well-formed hostile files, through every command that reads files of their kind.
+"""Soak test of every command that reads files, with well-formed hostile files.
 
-A command runs in a child of this process, which has the modules loaded; some of them in an
-interpreter of their own. It may take 5 s of the processor, its start included, and 1 GB; it says
-one line of at most 300 characters, and leaves nothing but its output.
+A command runs in a forked child of this process, which has the modules loaded, or sometimes in its
+own interpreter. It is allowed 5 s of processor time, including its start, and 1 GB; it must print
+one line of at most 300 characters, and leave nothing but its output.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from benchmarks.soak.outcome import Amount, Outcome
 from benchmarks.soak.scenes import CLIP
 from msg_tools import BagWriter
 
-# What a command may need: seconds of the processor, and of the clock where others use it, bytes,
-# characters in a line, and lines: warnings may come before the error.
+# Limits of a command: processor time, s; wall time on a busy machine, s; memory, bytes; characters
+# in a line; lines, because warnings may precede the error.
 SECONDS, WALL_SECONDS, MEMORY, CHARACTERS, LINES = 5.0, 40.0, 1e9, 300, 3
-# What a child of this process, which has the modules loaded, does not need of it, s.
+# Processor time for imports, which a forked child saves, s.
 _START = 1.5
-# One run of so many is in an interpreter of its own.
+# One run of this many uses its own interpreter.
 _ALONE = 20
-_LOOKS = 0.02  # s between two looks at a child
+_LOOKS = 0.02  # interval between two checks of a child, s
 
 _BAGS = '.mcap .db3 .zst .zstd folder'
 _TABLES = '.json .npz .csv .trc folder'
@@ -54,8 +54,8 @@ _IMPORT = 'hmt_ros import-video GOOD/video.avi -o OUT --quiet'
 _LIFT = 'hmt_ros lift GOOD/keypoints.npz -o OUT --fov 60 --size 640x480 --quiet'
 _LIFTED = 'GOOD/lifted/lifted'
 _MAKE = 'hmt_learning make-bag -o OUT --duration 0.1 --size 64x48'
-# What takes a file: suffixes, and the words of the command. FILE is the file, OUT the output, GOOD
-# a folder of good files.
+# Suffixes of the files that a command takes, and its arguments. FILE is the file, OUT the output,
+# GOOD a folder of good files.
 ROUTES: dict[str, tuple[str, str]] = {
     'replay': (_BAGS, _REPLAY),
     'replay on': (_BAGS, f'{_REPLAY} --keep-going --people'),
@@ -87,7 +87,7 @@ ROUTES: dict[str, tuple[str, str]] = {
 
 @dataclass
 class _Run:
-    """What a command did: its exit code or minus its signal, and what it took and said."""
+    """Result of a command: exit code or minus its signal, time, memory and output."""
 
     code: int
     seconds: float
@@ -97,7 +97,7 @@ class _Run:
 
 
 def hostile(amount: Amount, *, quick: bool = False, given: Path | None = None) -> Iterator[Outcome]:
-    """Every kind of hostile file, or the files of a folder, through what reads it."""
+    """Runs commands on every kind of hostile file, or on the files of a folder."""
     cv2.setNumThreads(1)
     for program in ('hmt_ros', 'hmt_learning'):
         for module, _ in importlib.import_module(f'{program}.app').COMMANDS.values():
@@ -112,7 +112,7 @@ def hostile(amount: Amount, *, quick: bool = False, given: Path | None = None) -
         end = time.monotonic() + amount.seconds
         for number, (kind, found) in enumerate(kinds.items()):
             outcome = Outcome(kind, 'well-formed and hostile, read by commands')
-            # What one kind does not need is left to the others.
+            # Time that one kind does not need is left to the others.
             part = replace(amount, seconds=(end - time.monotonic()) / (len(kinds) - number))
             _read_all(list(found), good, folder / 'case', part, outcome, quick=quick)
             yield outcome
@@ -129,7 +129,7 @@ def _copied(path: Path, at: Path) -> None:
 
 
 def _write_good_files(folder: Path) -> None:
-    """A short bag, the same as a video, keypoints and their poses."""
+    """Writes a short bag, a video of it, keypoints and their lifted poses."""
     folder.mkdir()
     info, images = read_messages(CLIP, [COMPRESSED])
     images = images[:3]
@@ -151,7 +151,7 @@ def _write_good_files(folder: Path) -> None:
 
 
 def write_video(path: Path) -> None:
-    """Three images of the clip."""
+    """Writes a video of three images of the clip."""
     _, images = read_messages(CLIP, [COMPRESSED])
     pictures = [cv2.imdecode(image.data, cv2.IMREAD_COLOR) for image in images[:3]]
     size = pictures[0].shape[1::-1]
@@ -170,7 +170,7 @@ def _read_all(
     *,
     quick: bool,
 ) -> None:
-    """Gives files to all that read them, in an order in which every part has some of each."""
+    """Gives files to all commands that read them, in random order."""
     runs = [
         (file, route)
         for file in files
@@ -191,7 +191,7 @@ def _read_all(
 def _read_one(
     file: Hostile, words: str, good: Path, case: Path, *, alone: bool
 ) -> tuple[_Run, list[str]]:
-    """What a command does with a file, and what it leaves that it should not."""
+    """Runs a command on a file; returns its result and the wrong files that it leaves."""
     for name in ('in', 'work', 'tmp', 'home', 'kept'):
         (case / name).mkdir(parents=True)
     try:
@@ -228,7 +228,7 @@ def _there(folder: Path) -> set[str]:
 
 
 def _filled(words: str, given: Mapping[str, Path]) -> list[str]:
-    """The words of a command, with paths in them."""
+    """The arguments of a command, with paths filled in."""
     filled = []
     for word in words.split():
         head = word.split('/')[0].split('.')[0]
@@ -237,7 +237,7 @@ def _filled(words: str, given: Mapping[str, Path]) -> list[str]:
 
 
 def _forked(words: Sequence[str], folder: Path, environment: Mapping[str, str]) -> tuple[int, Path]:
-    """Starts a command in a child of this process; its id, and the file of what it says."""
+    """Starts a command in a forked child; returns its process ID and output file."""
     program = importlib.import_module(f'{words[0]}.__main__')
     said = folder / 'said'
     sys.stdout.flush()
@@ -266,7 +266,7 @@ def _be_the_command(
         code = main()
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 1
-    except BaseException:  # noqa: BLE001 - as the interpreter shows it
+    except BaseException:  # noqa: BLE001 - shown as by the interpreter
         traceback.print_exc()
     finally:
         with suppress(Exception):
@@ -278,7 +278,7 @@ def _be_the_command(
 def _spawned(
     words: Sequence[str], folder: Path, environment: Mapping[str, str]
 ) -> tuple[int, Path]:
-    """As `_forked`, in an interpreter of its own."""
+    """As `_forked`, but in its own interpreter."""
     said = folder / 'said'
     with said.open('wb') as output:
         process = subprocess.Popen(
@@ -299,7 +299,7 @@ def _spawned(
 
 
 def _finished(started: tuple[int, Path], seconds: float) -> _Run:
-    """Waits for a command; ends it where it takes too much."""
+    """Waits for a command, and kills it if it exceeds a limit."""
     child, said = started
     peak, stopped = 0.0, ''
     end = time.monotonic() + WALL_SECONDS
@@ -308,7 +308,7 @@ def _finished(started: tuple[int, Path], seconds: float) -> _Run:
         done, status, usage = os.wait4(child, os.WNOHANG)
         if done:
             break
-        # At its end a process has no memory any more.
+        # A process that has just ended has no memory.
         with suppress(OSError, StopIteration):
             peak = max(peak, peak_memory(child))
             used = Path(f'/proc/{child}/stat').read_text('utf-8').rpartition(')')[2].split()
@@ -329,7 +329,7 @@ def _finished(started: tuple[int, Path], seconds: float) -> _Run:
 
 
 def _wrong(run: _Run) -> Iterator[str]:
-    """What a command must not do."""
+    """Describes what a command did wrong."""
     if run.stopped:
         yield run.stopped
     elif run.code not in (0, 1):

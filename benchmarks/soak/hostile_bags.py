@@ -17,16 +17,16 @@ from benchmarks.soak.hostile_file import ALIASES, CONTROL, DEEP, DIGITS, Hostile
 
 _MAGIC = b'\x89MCAP0\r\n'
 _BLOCK = 2**17  # content of the largest block of zstd, bytes
-_SKIPPED = b'\x50\x2a\x4d\x18' + bytes(4)  # a frame of zstd that holds nothing
+_SKIPPED = b'\x50\x2a\x4d\x18' + bytes(4)  # an empty skippable frame of zstd
 _SUFFIX = '\n' + '=' * 80 + '\nMSG: '
 
 
 def _types(first: str, others: dict[str, str]) -> str:
-    """A definition with those of the types in it."""
+    """A message definition followed by those of its nested types."""
     return first + ''.join(f'{_SUFFIX}a_msgs/{name}\n{text}' for name, text in others.items())
 
 
-# Definitions of a message: what a reader might do with more memory or time than they have bytes.
+# Message definitions that may cost a reader much more memory or time than their size.
 _DEFINITIONS = {
     'string_bound': 'string<=1000000000[1000000000] x\nstring[1000000000] y',
     'array': 'float64[1000000000] x',
@@ -144,11 +144,11 @@ _DATA_AT = len(_MAGIC) + len(_record(1, _string('ros2') + _string('')))
 
 
 def zstd_zeros(size: int, head: bytes = b'', *, window: int = 0x58, claims: int = -1) -> bytes:
-    """A zstd frame of a head and zeros, in four bytes for each 128 kB.
+    """A zstd frame of a head and zeros, compressed to four bytes per 128 kB.
 
     Args:
-        window: the byte that claims the memory a reader needs, by default 2 MB.
-        claims: size that the head of the frame tells; negative: it tells none.
+        window: window descriptor, which states the memory a reader needs; 2 MB by default.
+        claims: content size stated in the frame header; negative omits it.
     """
     told = b'' if claims < 0 else struct.pack('<Q', claims)
     blocks = [(len(head) << 3).to_bytes(3, 'little') + head] if head else []
@@ -160,7 +160,7 @@ def zstd_zeros(size: int, head: bytes = b'', *, window: int = 0x58, claims: int 
 
 
 def bags(good: Path) -> Iterator[Hostile]:
-    """MCAP files: one strange thing in a bag that has all that the commands look for."""
+    """MCAP files with one strange thing in an otherwise complete bag."""
     whole = _good_records(good)
     definitions = [(n, 'ros2msg', x) for n, x in _DEFINITIONS.items()]
     definitions += [(n, 'ros2idl', x) for n, x in _IDL_DEFINITIONS.items()]
@@ -179,7 +179,7 @@ def bags(good: Path) -> Iterator[Hostile]:
         yield Hostile(f'statistics_{name}.mcap', _mcap(whole, summary))
     for start in (1, 8, 2**40, 2**64 - 1):
         yield Hostile(f'summary_at_{start:x}.mcap', _mcap(whole, _statistics(), start=start))
-    # Messages of known types with lengths and sizes that claim much.
+    # Messages of known types with excessive lengths and sizes.
     for at in range(4, 120, 4):
         word = struct.pack('<I', 2**32 - 1 if at % 16 else 10**8)
         yield Hostile(f'word_{at}.mcap', partial(_changed, good, at, word))
@@ -188,7 +188,7 @@ def bags(good: Path) -> Iterator[Hostile]:
 
 
 def _changed(good: Path, at: int, word: bytes) -> bytes:
-    """The good bags with other bytes at a place of each message."""
+    """The good bags with some bytes of each message replaced."""
     return _mcap(_good_records(good, lambda data: data[:at] + word + data[at + len(word) :]))
 
 
@@ -206,9 +206,9 @@ def _good_records(
     """Schemas, channels and messages of the good bags, as records.
 
     Args:
-        change: of the bytes of a message.
-        definition: encoding and text that stand in the place of all, as of a_msgs/msg/A.
-        messages: whether they are wanted, too.
+        change: function applied to the bytes of each message.
+        definition: encoding and text that replace all definitions, written for a_msgs/msg/A.
+        messages: whether to include messages.
     """
     content: list[bytes] = []
     known: dict[str, int] = {}
@@ -255,7 +255,7 @@ def _of_names() -> Iterator[tuple[str, bytes]]:
 
 
 def _records() -> dict[str, bytes]:
-    """Records that are many, or that claim to be large."""
+    """Very many records, and records that claim to be large."""
     attachment = _record(9, bytes(16) + _string('../../kept/canary') + _string('') + bytes(12))
     claim = bytes(16) + _string('x') + _string('') + struct.pack('<Q', 2**40)
     metadata = _record(12, _string(CONTROL) + _string(_string('a') + _string('b')))
@@ -333,7 +333,7 @@ _TOPIC_ROW = (
     "'' AS offered_qos_profiles FROM c"
 )
 _DOUBLED = 'CREATE VIEW v{1} AS SELECT * FROM v{0} UNION ALL SELECT * FROM v{0}'
-# In the place of the messages, or of their topics, something that a reader need only select.
+# Views in the place of messages or topics, which run when a reader selects from them.
 _MESSAGES_AS = {
     'endless': _COUNT.format('') + _ROW,
     'joins': "SELECT a.x AS id, 1 AS topic_id, a.x AS timestamp, x'00' AS data "
@@ -350,7 +350,7 @@ _BEFORE = {
         *(_DOUBLED.format(i - 1, i) for i in range(1, 40)),
     ),
 }
-# After tables of topics and messages.
+# Statements run after the tables of topics and messages are created.
 _STATEMENTS: dict[str, Sequence[str]] = {
     'names': (
         f"UPDATE topics SET name = '{CONTROL}', type = '{'/x' * 50_000}' WHERE id = 1",
@@ -386,7 +386,7 @@ _STATEMENTS: dict[str, Sequence[str]] = {
 
 
 def databases() -> Iterator[Hostile]:
-    """SQLite files of what a reader that only selects runs into."""
+    """SQLite files that are hostile even to a reader that only selects."""
     found: dict[str, Sequence[str]] = {
         name: (*_TOPICS, *_BEFORE.get(name, ()), f'CREATE VIEW messages AS {text}')
         for name, text in _MESSAGES_AS.items()
@@ -413,7 +413,7 @@ def _write_database(statements: Sequence[str], path: Path) -> None:
 
 
 def compressed_bags(good: Path) -> Iterator[Hostile]:
-    """Bags inside zstd files that claim, or are, much."""
+    """Bags in zstd files that are, or claim to be, very large."""
     whole = _mcap(_good_records(good))
     database = b'SQLite format 3\0'
     for name, content in {

@@ -1,4 +1,4 @@
-"""A hostile file, and text that many kinds of hostile files have in common."""
+"""A hostile file, and text shared by many kinds of hostile files."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-# Names that reach a terminal: escape sequences, ends of lines, a change of direction.
+# Name that attacks a terminal: escape sequences, line ends, a change of text direction.
 CONTROL = '/\x1b]0;owned\x07\x1b[2J\r\n\x9b31m\u202egpj\x7f\x08'
 DIGITS = '9' * 1_000_000
 DEEP = '[' * 100_000 + ']' * 100_000
-# As few characters as expand to ten thousand million.
+# Short YAML whose aliases expand to ten thousand million entries.
 ALIASES = 'a: &a [x, x, x, x, x, x, x, x, x, x]\n' + ''.join(
     f'{b}: &{b} [{", ".join([f"*{a}"] * 10)}]\n'
     for a, b in zip('abcdefghi', 'bcdefghij', strict=True)
@@ -19,12 +19,13 @@ ALIASES = 'a: &a [x, x, x, x, x, x, x, x, x, x]\n' + ''.join(
 
 @dataclass(frozen=True)
 class Hostile:
-    """A file that somebody made on purpose.
+    """A file made to attack its reader.
 
     Attributes:
-        name: of the file, whose suffix tells what reads it; a folder has none.
-        content: bytes or text, or what makes them; None: `write` writes the file to a path.
-        routes: what reads it; empty: all that read files with its suffix.
+        name: name of the file; its suffix selects the readers. A folder has none.
+        content: bytes, text, or a function that returns them; None if `write` writes the file.
+        write: function that writes the file to a path.
+        routes: names of the readers; empty selects all for the suffix.
     """
 
     name: str
@@ -34,7 +35,7 @@ class Hostile:
 
     @property
     def suffix(self) -> str:
-        """That of the name, or 'folder'."""
+        """Suffix of the name, or 'folder'."""
         return 'folder' if self.name.startswith('folder_') else Path(self.name).suffix
 
     def make(self, path: Path) -> None:
@@ -49,10 +50,10 @@ class Hostile:
 
 
 def alias_bomb() -> str:
-    """Aliases in a list, as profiles of quality of service are."""
+    """Aliases in a list, the form of QoS profiles."""
     return '- ' + '\n- '.join(line.partition(': ')[2] for line in ALIASES.splitlines()) + '\n'
 
 
 def bare(text: str) -> str:
-    """A document inside of another one."""
+    """A document indented for inclusion in another one."""
     return ''.join(f'    {line}\n' for line in text.splitlines())

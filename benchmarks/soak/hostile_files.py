@@ -1,4 +1,4 @@
-"""Well-formed hostile files of the other kinds: tables, calibrations, models, images, videos."""
+"""Well-formed hostile files other than bags: tables, calibrations, models, images, videos."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from benchmarks.soak.hostile_bags import YAML_BOMBS, bag_folders, bags, compress
 from benchmarks.soak.hostile_file import CONTROL, DEEP, DIGITS, Hostile
 from benchmarks.soak.scenes import CLIP
 
-# What stands in the place of a value: words, and what is long or holds spaces.
+# Hostile values: words, then long ones and ones with spaces.
 _WORDS = """
 1e999 -1e999 .nan 1e-320 [] {} null [[1]] 0xffffffffffffffffffffff /etc/passwd
 /dev/zero ../../kept/canary . 1_0_0 yes  "\\e[2J\\u202e\\n" "\\ud800"
@@ -45,7 +45,7 @@ _XML = '<?xml version="1.0"?>\n<opencv_storage>{}</opencv_storage>\n'
 
 
 def hostile_files(good: Path) -> dict[str, Iterable[Hostile]]:
-    """Files of each kind; what needs more than text is made when it is written.
+    """Hostile files by kind; large contents are generated when the file is written.
 
     Args:
         good: folder of good files.
@@ -70,7 +70,7 @@ def hostile_files(good: Path) -> dict[str, Iterable[Hostile]]:
 
 
 def _yaml() -> Iterator[Hostile]:
-    """Documents, and those that commands read with one strange value each."""
+    """YAML documents, and input files of the commands with one strange value each."""
     documents = {
         **YAML_BOMBS,
         'list_lists': '[' + '[], ' * 200_000 + '1]',
@@ -234,7 +234,7 @@ def _json() -> Iterator[Hostile]:
 
 
 def _dumped(document: Any) -> str:
-    """JSON; Python itself does not write an integer of so many digits."""
+    """JSON; an integer with too many digits for Python is replaced by text."""
     try:
         return json.dumps(document)
     except ValueError:
@@ -294,7 +294,7 @@ def _npy(head: str | Mapping[str, Any], content: bytes = b'abc', version: int = 
 
 
 class _Call:
-    """What a pickle calls when it is read."""
+    """Object whose pickle runs a shell command when it is loaded."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return os.system, ('touch ../kept/pwned',)
@@ -388,13 +388,13 @@ def _zip(members: Mapping[str, bytes], zeros: int = 0) -> bytes:
 
 
 def zeros_archive(size: int, count: int = 1) -> bytes:
-    """An archive of arrays of zeros, each of so many bytes when it is unpacked."""
+    """An archive of `count` arrays of zeros, each about `size` bytes when unpacked."""
     head = _npy({'descr': '<f8', 'fortran_order': False, 'shape': (size // 96, 6, 2)}, b'')
     return _zip({f'pixels{i or ""}': head for i in range(count)}, size)
 
 
 def _lying(data: bytes) -> bytes:
-    """An archive whose directory tells other sizes than there are."""
+    """The archive with a wrong size in its directory."""
     at = data.rindex(b'PK\x01\x02')
     return data[: at + 24] + struct.pack('<I', 100) + data[at + 28 :]
 
@@ -406,7 +406,7 @@ def _saved(arrays: Mapping[str, Any]) -> bytes:
 
 
 def _models() -> Iterator[Hostile]:
-    """Models that ship, with one array changed: whole, and of the right type."""
+    """Bundled models with one array replaced by hostile values of the right type."""
     for name in ('silhouettes', 'keypoints'):
         with np.load(ROOT / 'hmt_ros' / 'experts' / 'models' / f'{name}.npz') as archive:
             arrays = dict(archive)
@@ -458,7 +458,7 @@ def _zeros(size: int) -> bytes:
 
 
 def _claimed_images() -> Iterator[tuple[str, bytes]]:
-    """Images that claim to be large, by suffix; each claims it in the words of its format."""
+    """Names and contents of images of many formats whose headers claim a large size."""
     for side in (20_000, 60_000, 2**31 - 1):
         square, short = struct.pack('<II', side, side), struct.pack('>HH', side % 65536, 65000)
         content = _zeros(2**20 if side > 20_000 else side * (side + 1))
@@ -494,7 +494,7 @@ def _tiff(tags: Mapping[int, int]) -> bytes:
 
 
 def _images() -> Iterator[Hostile]:
-    """Pictures, and the same in folders of frames and of masks."""
+    """Images, alone and in folders of frames or masks."""
     text = _part(b'zTXt', b'a\0\0' + zlib.compress(bytes(2**26)))
     profile = _part(b'iCCP', b'a\0\0' + zlib.compress(bytes(2**26)))
     pixel = zlib.compress(bytes(64 * 65))
@@ -588,7 +588,7 @@ _SUFFIXES = '.mcap .db3 .zstd .yaml .xml .json .toml .npz .csv .trc .png .jpg .m
 
 
 def _no_files() -> Iterator[Hostile]:
-    """What stands in the place of a file and is none."""
+    """Links, pipes, folders and other odd things in the place of a file."""
     links = {'zeros': '/dev/zero', 'random': '/dev/urandom', 'memory': '/proc/self/mem'}
     for suffix in _SUFFIXES.split():
         for name, target in links.items():
@@ -628,8 +628,8 @@ def _write_many(path: Path) -> None:
 
 
 def _outputs() -> Iterator[Hostile]:
-    """Places of outputs that lead elsewhere: links to a folder, and to a file, of somebody else."""
-    # A folder on the way to an output may be a link.
+    """Output paths that lead elsewhere, such as links to folders and files of other users."""
+    # A folder in the path of an output is allowed to be a link.
     over = ('written over',)
     yield Hostile('link.out', write=partial(_link, '../kept'), routes=over)
     yield Hostile('linked_file.out', write=partial(_link, '../kept/canary'))

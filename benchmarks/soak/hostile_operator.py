@@ -1,7 +1,7 @@
-"""The soak of a hostile operator, who may call a node's services and publish on its topics.
+"""Soak test with a hostile operator, who calls a node's services and publishes on its topics.
 
-The node gets images meanwhile, each when the one before is answered: how long it is silent tells
-whether somebody can stop it.
+Meanwhile the node gets images, each after the previous one is answered; long gaps between answers
+show that the operator can stop it.
 """
 
 from __future__ import annotations
@@ -29,41 +29,41 @@ from hmt_ros.app.replay.player import LiveNodeError
 from hmt_ros.sessions.declared_parameters import declared_parameters
 from hmt_ros.sessions.image_inputs import KEYPOINTS, MASK
 
-# Longest time without an answer to a call, and longer than usual without one to an image, s.
+# Maximum time to answer a call, and maximum excess over the usual time to answer an image, s.
 ANSWER, GAP = 1.0, 0.5
-# Time for a call before the node counts as lost, that floods take, and without an answer in one, s;
-# characters of a reason.
+# Time for a call before the node counts as lost, duration of a flood, maximum gap in a flood, s;
+# maximum characters of a reason.
 _LOST, _FLOOD, _FLOOD_GAP, _CHARACTERS = 40.0, 2.0, 2.0, 300
 _TOKEN = 'xylophone4711'
 _PASSWORDS = Path('/etc/passwd')
 
 
 def _while(amount: Amount) -> float:
-    """How long something is done, s."""
+    """Duration of a flood or of a quiet phase, s."""
     return min(_FLOOD, max(0.3, 0.02 * amount.times), amount.seconds / 4)
 
 
 class _Fed:
-    """A node that gets its messages one after the other, while others are done to it.
+    """A node that gets its messages one by one, during other actions on it.
 
     Attributes:
-        gap: longest time without an answer, s.
+        gap: maximum time without an answer, s.
     """
 
     def __init__(self, watched: Watched) -> None:
         self.watched = watched
-        # The client of its service has to be known to the node before time is taken.
+        # The node must know the client of its service before times are measured.
         watched.begin_to_set()
         self.begin()
 
     def begin(self) -> None:
-        """Counts from zero."""
+        """Restarts the measurement of gaps."""
         self._sent = False
         self._last = time.monotonic()
         self.gap = 0.0
 
     def until(self, done: Callable[[], bool], seconds: float) -> bool:
-        """Goes on until something is true; whether it is in time."""
+        """Feeds the node until a condition holds; returns whether it held in time."""
         end = time.monotonic() + seconds
         while not done():
             if time.monotonic() > end:
@@ -72,7 +72,7 @@ class _Fed:
         return True
 
     def step(self) -> None:
-        """Gives the next message, and hears what there is."""
+        """Sends the next message if the last is answered, and receives answers."""
         watched, counted = self.watched, self.watched.scene.session.COUNTED
         watched.check_alive()
         if not self._sent:
@@ -88,7 +88,7 @@ class _Fed:
         self.gap = max(self.gap, now - self._last)
 
     def usual_gap(self, seconds: float) -> float:
-        """The longest gap of a while in which nothing else is done."""
+        """The maximum gap during a quiet phase."""
         self.until(lambda: False, seconds)
         usual = self.gap
         self.begin()
@@ -101,7 +101,7 @@ class _Fed:
 
 
 def files_in_parameters(watched: Watched, amount: Amount, outcome: Outcome) -> None:
-    """Odd files as values of file parameters: reasons repeat no content, and calls do not wait."""
+    """Sets file parameters to odd files; reasons must not reveal content, nor calls block."""
     scene = watched.scene
     names = [
         parameter.name
@@ -109,7 +109,7 @@ def files_in_parameters(watched: Watched, amount: Amount, outcome: Outcome) -> N
         if isinstance(parameter.default, str) and parameter.name in scene.session.CHECKED
     ]
     usual_values = dict(zip(names, watched.get(names), strict=True))
-    # The working folder and the home are where a node may read by default.
+    # By default a node is allowed to read the working folder and the home folder.
     with TemporaryDirectory(prefix='.hmt_ros.', dir=Path.home()) as folder:
         values = list(islice(_odd_values(Path(folder)), amount.times))
         given = [(name, value) for value in values for name in names]
@@ -133,7 +133,7 @@ def files_in_parameters(watched: Watched, amount: Amount, outcome: Outcome) -> N
 
 
 def _set(fed: _Fed, name: str, value: str, outcome: Outcome) -> tuple[bool, str]:
-    """Sets a parameter while the node works."""
+    """Sets a parameter while the node is fed."""
     future = fed.watched.begin_to_set(**{name: value})
     if not fed.until(future.done, ANSWER):
         outcome.fault(f'{name} = {_short(value)}: no answer after {ANSWER:g} s')
@@ -155,7 +155,7 @@ def _look_for_content(text: str, value: str, where: str, outcome: Outcome) -> No
 
 
 def _odd_values(folder: Path) -> Iterator[str]:
-    """Names of files, of no files, and of what never ends; the worst last."""
+    """Paths of files, of other things, and of endless ones; the worst last."""
     texts = {
         'key.yaml': f'keypoints: {{{_TOKEN}: [1, 2]}}\nstamp_ns: {_TOKEN}\n',
         'value.yaml': f'stamp_ns: {_TOKEN}\nsigma_px: 1\nkeypoints: {{}}\n',
@@ -195,7 +195,7 @@ def _odd_values(folder: Path) -> Iterator[str]:
 
 
 def floods(watched: Watched, amount: Amount, outcome: Outcome) -> None:
-    """Calls and messages as fast as this process makes them; images go on, and so do calls."""
+    """Floods the node with calls and messages; images and calls must still be answered."""
     fed = _Fed(watched)
     usual = fed.usual_gap(_while(amount))
     rng = np.random.default_rng(0)
@@ -217,7 +217,7 @@ def floods(watched: Watched, amount: Amount, outcome: Outcome) -> None:
         due = time.monotonic()
         end = due + _while(amount)
         while time.monotonic() < end:
-            # A thousand a second, and no more at once than this process also listens to.
+            # At most a thousand per second, each followed by listening to answers.
             if time.monotonic() >= due:
                 act()
                 due += 1e-3
@@ -235,7 +235,7 @@ def floods(watched: Watched, amount: Amount, outcome: Outcome) -> None:
 
 
 def stray_stamps(watched: Watched, amount: Amount, outcome: Outcome) -> None:
-    """Stamps that cannot be, in messages of every source, and a clock that is set back."""
+    """Sends impossible timestamps in messages of every source, and sets the clock back."""
     scene, counted = watched.scene, watched.scene.session.COUNTED
     inputs = [source for source in (KEYPOINTS, MASK) if source in scene.others]
     watched.set(**{f'use_{source}': True for source in inputs})
@@ -257,7 +257,7 @@ def stray_stamps(watched: Watched, amount: Amount, outcome: Outcome) -> None:
 
     begin()
     refused(3)
-    # A source whose messages have no stamp can not be given one.
+    # Only sources whose messages have timestamps.
     sources = [
         source
         for source in (*scene.others, counted)
@@ -292,7 +292,7 @@ def _any_message(scene: Any, source: str) -> Any:
 
 
 def _with_stamp(message: Any, seconds: int, nanoseconds: int) -> Any:
-    """A message with a stamp of any numbers."""
+    """The message with an arbitrary timestamp."""
     if hasattr(message, 'transforms'):
         return replace(
             message, transforms=[_with_stamp(x, seconds, nanoseconds) for x in message.transforms]

@@ -1,4 +1,4 @@
-"""The soak without DDS: damaged messages into the sessions behind the nodes."""
+"""Soak test without DDS: damaged messages for the sessions of the nodes."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from hmt_ros.sessions.tracking_session import TrackingSession
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.cdr import deserialise, serialise
 
-# So many damaged messages, then a valid one, which has to be used.
+# Number of damaged messages before a valid one, which must be used.
 _BETWEEN = 200
-# A session is replaced after so many: damage may have put it where little more can happen.
+# Number of messages after which a session is replaced, because damage may have disabled it.
 _LIFE = 500
 
 
 def messages(amount: Amount, *, quick: bool = False) -> Iterator[Outcome]:
-    """Messages through every subscriber and service of every node."""
-    # A session does not know which process it is in.
+    """Sends messages to every subscriber and service of every node."""
+    # Sessions do not depend on the process, so shared processes are skipped.
     alone = [scene for scene in scenes().values() if not scene.together]
     if quick:
         alone = [scenes()['bme_node']]
@@ -45,7 +45,7 @@ def messages(amount: Amount, *, quick: bool = False) -> Iterator[Outcome]:
 def _through(scene: Scene, amount: Amount) -> Outcome:
     outcome = Outcome(scene.node, 'damaged messages, in process')
     fed = _Fed(scene, outcome)
-    # What every variant needs is in memory before the damage.
+    # All variants are loaded before the damage.
     for _ in scene.variants:
         fed.check()
         fed.begin()
@@ -55,7 +55,7 @@ def _through(scene: Scene, amount: Amount) -> Outcome:
 
 @contextmanager
 def _watched_memory(outcome: Outcome) -> Iterator[None]:
-    """Notes by how much the memory of this process grows at most meanwhile."""
+    """Records the maximum growth of this process's memory in the meantime."""
     forget_peak()
     before = resident_memory()
     yield
@@ -66,11 +66,11 @@ def _watched_memory(outcome: Outcome) -> Iterator[None]:
 
 
 class _Fed:
-    """A session, and what it is given.
+    """A session and its inputs.
 
     Args:
-        scene: of the node.
-        outcome: what is told of it.
+        scene: scene of the node.
+        outcome: outcome to fill.
     """
 
     def __init__(self, scene: Scene, outcome: Outcome) -> None:
@@ -81,18 +81,18 @@ class _Fed:
 
     @property
     def asked(self) -> str:
-        """The source whose type its service takes."""
+        """The source with the message type of the node's service."""
         return PREDICTION if PREDICTION in self.valid else self.scene.session.COUNTED
 
     def take(self, source: str, data: bytes) -> None:
-        """Gives it bytes as its node would."""
+        """Gives bytes to the session as its node would."""
         self.outcome.times += 1
         if self.outcome.times % _LIFE == 0:
             self.begin()
         try:
             message = deserialise(data, self.valid[source].__msgtype__)
         except Exception as error:  # noqa: BLE001
-            # As in the node: generated code does not say what it may raise.
+            # As in the node, because the errors of generated code are not specified.
             self.outcome.refused += 1
             self.session.refuse(source, error_line(error))
             return
@@ -106,7 +106,7 @@ class _Fed:
         self._compare(handled.published)
 
     def ask(self, data: bytes) -> None:
-        """Gives bytes to its service."""
+        """Gives bytes to the node's service."""
         self.outcome.times += 1
         try:
             message = deserialise(data, self.valid[self.asked].__msgtype__)
@@ -121,11 +121,10 @@ class _Fed:
             self.outcome.fault(f'service: {place(error)}')
 
     def check(self) -> None:
-        """Damage is over: a valid message has to be used, of a fresh stream at the latest."""
+        """Checks that a valid message is used after damage, at the latest by a fresh session."""
         for attempt in range(2):
             if attempt:
-                # What came before may have left a track that fits nothing, or a stamp of the
-                # future.
+                # Damage may have left a wrong track or a timestamp in the future.
                 self.begin()
             for source, message in self.scene.prelude:
                 self.session.take(source, message)
@@ -137,18 +136,18 @@ class _Fed:
         self.outcome.fault(f'a valid message is refused: {handled.faults[0]}')
 
     def begin(self) -> None:
-        """A fresh session, of the next variant."""
+        """Starts a fresh session with the next variant."""
         changes = self.scene.variants[self._lives % len(self.scene.variants)]
         self._lives += 1
         self._next = 0
         self.valid = self.scene.valid(changes.get('image_transport', ''))
         parameters = replace(self.scene.parameters, **changes)
         self.session: Session[Any, Any] = self.scene.session(parameters, self._published.append)
-        # The one before is in a cycle with its track.
+        # The previous session and its track form a reference cycle.
         gc.collect()
 
     def _compare(self, told: tuple[tuple[str, int], ...]) -> None:
-        """What is said to be published is, and can be read."""
+        """Checks that announced messages were published and can be read."""
         made = tuple((output.topic, output.stamp_ns) for output in self._published)
         if told != made:
             self.outcome.lost += len(set(told) - set(made)) or 1
@@ -158,13 +157,13 @@ class _Fed:
 
 
 def ask(session: Any, message: Any) -> None:
-    """What the service of a node does with a message.
+    """Does what the service of a node does with a message.
 
     Raises:
         ValueError, ArithmeticError: a clean refusal.
     """
     if isinstance(session, PeopleSession):
-        # It takes nothing but an empty request.
+        # Its request is empty.
         prepare_start(session.parameters)
     elif isinstance(session, TrackingSession):
         prepare_start(session.parameters, message, session.state.body)

@@ -1,4 +1,4 @@
-"""The soak of nodes in processes of their own, which are fed over DDS."""
+"""Soak test of nodes that run in their own processes and are fed over DDS."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from hmt_ros.sessions.image_inputs import PREDICTION
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.cdr import canonical, serialise
 
-# Messages against what the node can take.
+# Message rate relative to what the node can process.
 OVERLOAD = 5.0
-# States are 1 unconfigured, 2 inactive, 3 active; state and transition to the state that follows.
+# Next state by state and transition; states are 1 unconfigured, 2 inactive, 3 active.
 _CONFIGURE, _CLEANUP, _ACTIVATE, _DEACTIVATE = 1, 2, 3, 4
 _FOLLOWING = {
     (1, _CONFIGURE): 2,
@@ -40,7 +40,7 @@ _FOLLOWING = {
 
 
 def transitions(watched: Watched, amount: Amount, outcome: Outcome) -> None:
-    """Every transition in every state, and on at random; those that do not exist are refused."""
+    """Tries every transition in every state, then random ones; invalid ones must be refused."""
     rng = np.random.default_rng(0)
     state = watched.state()
     open_pairs = set(itertools.product((1, 2, 3), (1, 2, 3, 4)))
@@ -67,7 +67,7 @@ def transitions(watched: Watched, amount: Amount, outcome: Outcome) -> None:
 
 
 def killed(watched: Watched, amount: Amount, outcome: Outcome) -> None:
-    """Killed while it computes: what it had answered is there; the next one takes over."""
+    """Kills and restarts the node while it computes; all announced messages must arrive."""
     rng = np.random.default_rng(0)
     for _ in amount.counted():
         begin = time.monotonic()
@@ -87,7 +87,7 @@ def killed(watched: Watched, amount: Amount, outcome: Outcome) -> None:
 
 
 def _has_come(watched: Watched) -> bool:
-    """Whether all messages that an answer names have arrived, from a node that has ended."""
+    """Whether all messages named by an answer have arrived from a node that has ended."""
     try:
         watched.node.answer('message', 0.0)
     except LiveNodeError:
@@ -96,7 +96,7 @@ def _has_come(watched: Watched) -> bool:
 
 
 def changed_parameters(watched: Watched, amount: Amount, outcome: Outcome) -> None:
-    """Random values, valid or not, between messages; what was agreed to is there."""
+    """Sets random parameters, valid or not, between messages; accepted ones must be in effect."""
     rng = np.random.default_rng(0)
     declared = [p for p in declared_parameters(watched.scene.parameters) if p.effect != 'at launch']
     names = [parameter.name for parameter in declared]
@@ -137,12 +137,12 @@ def _set_back(
 
 
 def _plain(value: Any) -> Any:
-    """A value as it is compared: ROS gives lists back as arrays."""
+    """A value for comparison, because ROS returns lists as arrays."""
     return list(value) if isinstance(value, list | array | tuple) else value
 
 
 def _any_value(parameter: DeclaredParameter, rng: np.random.Generator) -> Any:
-    """A value of a parameter: near the usual one, at a limit, beyond, or of another type."""
+    """Random value of a parameter: near the default, beyond a limit, or of another type."""
     default, kind = parameter.default, rng.random()
     if kind < 0.1:
         wrong: tuple[Any, ...] = ('', 'pigeon', -1, 2**40, float('nan'), True, [1, 2], [b'x'])
@@ -158,13 +158,13 @@ def _any_value(parameter: DeclaredParameter, rng: np.random.Generator) -> Any:
     if kind < 0.2:
         value = (low - 1, high + 1, -1e300, np.inf, -np.inf)[int(rng.integers(0, 5))]
         whole = isinstance(default, int) and np.isfinite(value)
-        return int(max(value, -(2.0**63))) if whole else value  # as small as a message holds
+        return int(max(value, -(2.0**63))) if whole else value  # the minimum in a message
     near = float(np.clip(default * np.exp2(rng.uniform(-1.0, 1.0)), low, high))
     return near if isinstance(default, float) else round(near)
 
 
 def jumping_clock(watched: Watched, amount: Amount, outcome: Outcome) -> None:
-    """Stamps and the clock of the simulation jump; every message is answered."""
+    """Lets timestamps and the simulation clock jump; every message must be answered."""
     from rosgraph_msgs.msg import Clock
 
     rng = np.random.default_rng(0)
@@ -195,7 +195,7 @@ def jumping_clock(watched: Watched, amount: Amount, outcome: Outcome) -> None:
 
 
 def overload(watched: Watched, amount: Amount, outcome: Outcome) -> None:
-    """Messages faster than they can be used: bounded, the newest is used, drops are counted."""
+    """Sends messages too fast; the newest must be used, and dropped ones counted."""
     watched.settle(0.1)
     begin = time.monotonic()
     for _ in range(5):
@@ -217,21 +217,21 @@ def overload(watched: Watched, amount: Amount, outcome: Outcome) -> None:
 
     def adds_up() -> bool:
         told = change['used'] + change['skipped'] + change['dropped']
-        # An image in which people_node tracks nobody is none of these.
+        # An image in which people_node tracks nobody is in none of these counts.
         nobody = watched.scene.node == 'people_node' and not change['used']
         return told == change['received'] or (nobody and told < change['received'])
 
     while time.monotonic() < end:
         heard += watched.settle(1.0)
         change = {what: count - counts[what] for what, count in _counts(watched).items()}
-        # Diagnostics may be of the time before the answer.
+        # Diagnostics may be older than the answer.
         if change['received'] == len(heard) and adds_up():
             break
     if heard[-1].stamp_ns != watched.scene.stamp(watched.index - 1):
         outcome.fault('the newest message is not the last that is used')
     if not adds_up():
         outcome.fault(f'counts do not add up: {change}')
-    # Those that were dropped are answered, too.
+    # Dropped messages are answered, too.
     outcome.lost += abs(change['received'] - len(heard))
     unheard = outcome.times - change['received']
     outcome.done += f': {change["used"]} used, {change["dropped"]} dropped and answered'
@@ -252,7 +252,7 @@ def _counts(watched: Watched) -> dict[str, int]:
 
 
 def damaged_bytes(watched: Watched, amount: Amount, outcome: Outcome) -> None:
-    """Damaged bytes on every topic and in every service; each is answered."""
+    """Sends damaged bytes to every topic and service; each must be answered."""
     rng = np.random.default_rng(0)
     valid = {source: serialise(message) for source, message in watched.scene.valid().items()}
     sources = list(valid)
@@ -263,7 +263,7 @@ def damaged_bytes(watched: Watched, amount: Amount, outcome: Outcome) -> None:
             outcome.refused += not _asked(watched, rng)
             continue
         source = sources[chosen]
-        # A message of no bytes, which no ROS publisher can send, stops a reliable topic in DDS.
+        # An empty message, which no ROS publisher can send, would block a reliable topic in DDS.
         watched.node.publish_bytes(source, damaged(valid[source], rng) or b'\0')
         try:
             handled = watched.answer(SHORT)
@@ -275,7 +275,7 @@ def damaged_bytes(watched: Watched, amount: Amount, outcome: Outcome) -> None:
 
 
 def _asked(watched: Watched, rng: np.random.Generator) -> bool:
-    """Whether the service of a node takes a damaged request."""
+    """Whether the service of a node accepts a damaged request."""
     from builtin_interfaces.msg import Time
     from hmt_msgs.srv import PredictPose, Reset, SmoothWindow
     from rclpy.serialization import deserialize_message
@@ -300,7 +300,7 @@ def _asked(watched: Watched, rng: np.random.Generator) -> bool:
         data = canonical(damaged(serialise(valid), rng), msgtype)
         message = deserialize_message(data, watched.player.classes[msgtype])
     except Exception:  # noqa: BLE001
-        # Not even a client could send it.
+        # No client could send such a request.
         return False
     if tracks:
         return bool(watched.node.call(Reset, 'reset', initial=message).success)
@@ -309,7 +309,7 @@ def _asked(watched: Watched, rng: np.random.Generator) -> bool:
 
 Case = Callable[[Watched, Amount, Outcome], None]
 
-# What is said of it, the case, and how often it is done where transitions are made once.
+# Description, function and repetitions of each case, the latter relative to transitions.
 CASES: tuple[tuple[str, Case, float], ...] = (
     ('transitions of the lifecycle in every order', transitions, 1.0),
     ('parameters changed while it runs', changed_parameters, 2.0),
@@ -323,20 +323,20 @@ CASES: tuple[tuple[str, Case, float], ...] = (
 )
 
 
-# Nodes that are fed by no scene, and the words for their command lines. Without what they need, a
-# detector or hri_msgs, they stay unconfigured.
+# Nodes without a scene, and their command-line arguments. They stay unconfigured if a detector or
+# hri_msgs is missing.
 _ALONE = {
     'camera_node': ('VIDEO', '--fov', '60', '--ros-args', '-p', 'loop:=true'),
     'keypoints_node': (),
     'hri_node': (),
 }
 _USUAL_GAP = 2.0
-# A case takes so long at least, s.
+# Minimum duration of a case, s.
 _LEAST = 2.0
 
 
 def alone(name: str, amount: Amount) -> Outcome:
-    """A node by itself: strange parameters and requests are answered, images go on, it stays."""
+    """Sends strange parameters to one node; it must answer, keep running and publish images."""
     from rcl_interfaces.srv import SetParameters
     from rclpy.parameter import Parameter
     from rclpy.qos import qos_profile_sensor_data
@@ -396,7 +396,7 @@ def alone(name: str, amount: Amount) -> Outcome:
 
 
 def nodes(amount: Amount, *, quick: bool = False) -> Iterator[Outcome]:
-    """Every case with every node; a node goes from case to case while it lives."""
+    """Runs every case with every node; a node is reused for the next case while it is alive."""
     chosen = [scenes()['smoother_node']] if quick else [*scenes().values()]
     by_themselves = () if quick else _ALONE
     end = time.monotonic() + amount.seconds
@@ -404,18 +404,18 @@ def nodes(amount: Amount, *, quick: bool = False) -> Iterator[Outcome]:
     for scene in chosen:
         with ExitStack() as running:
             watched: Watched | None = None
-            # The last one starts a node again, which takes seconds of the processor.
+            # The last case restarts nodes, which costs seconds of processor time.
             for done, case, share in CASES[: -1 if quick else None]:
                 outcome = Outcome(scene.title, done)
                 try:
                     if watched is None:
                         watched = running.enter_context(Watched(scene))
                         watched.warm_up()
-                    # What one case takes too much, and each start, is taken from all that follow.
+                    # Overtime of a case, and each start, shortens all later cases.
                     seconds = max((end - time.monotonic()) / left, _LEAST)
                     part = Amount(max(1, round(amount.times * share)), seconds)
                     _do(case, watched, part, outcome)
-                except Exception as error:  # noqa: BLE001 - told, and other cases follow
+                except Exception as error:  # noqa: BLE001 - reported, and other cases follow
                     known = isinstance(error, LiveNodeError | Silent | TimeoutError)
                     outcome.fault(error_line(error) if known else place(error))
                     running.close()
@@ -428,7 +428,7 @@ def nodes(amount: Amount, *, quick: bool = False) -> Iterator[Outcome]:
 
 
 def _do(case: Case, watched: Watched, part: Amount, outcome: Outcome) -> None:
-    """Does a case with a node, and looks at its memory and at what it says."""
+    """Runs a case with a node, and checks its memory and its log."""
     process, said = watched.node.process.pid, len(watched.traces())
     forget_peak(process)
     before = resident_memory(process)

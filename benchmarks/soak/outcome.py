@@ -1,4 +1,4 @@
-"""What a case of the soak reports, what is a fault of our code, and how long a case may take."""
+"""Outcome and amount of a case of the soak test, and descriptions of faults."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from pathlib import Path
 
 from msg_tools.files.error_line import error_line
 
-# What a case may need of memory beyond what the process had before, MB.
+# Maximum growth of a process's memory in a case, MB.
 MOST_GROWTH = 150.0
-# What may stay of it: buffers, and code that is loaded when it is first needed, MB.
+# Maximum growth that remains, for buffers and code that is loaded late, MB.
 MOST_KEPT = 25.0
-# Faults that are told of a case; the others are counted.
+# Maximum number of faults reported for a case; others are counted.
 _TOLD = 5
 
 
 @dataclass
 class Outcome:
-    """What came of one case.
+    """Outcome of one case.
 
     Attributes:
-        of: what it was done to: a node, or a kind of file.
-        done: what was done.
-        times: how often.
-        refused: how often the answer was a clean error.
-        lost: what had been acknowledged and is not there.
-        growth_mb: of the peak of resident memory; None: not measured.
-        kept_mb: growth that is left at the end.
-        faults: what went wrong otherwise; empty: alive, or a clean error, every time.
+        of: subject of the test: a node, or a kind of file.
+        done: description of the action.
+        times: number of actions.
+        refused: number of answers that were clean errors.
+        lost: number of acknowledged things that are missing.
+        growth_mb: growth of the peak resident memory, MB; None if not measured.
+        kept_mb: growth that remains at the end, MB.
+        faults: other faults; empty if every answer was good or a clean error.
     """
 
     of: str
@@ -47,7 +47,7 @@ class Outcome:
     faults: list[str] = field(default_factory=list)
 
     def fault(self, text: str) -> None:
-        """Tells of something that must not be; the same thing once."""
+        """Adds a fault, unless it is known."""
         if text not in self.faults:
             self.faults.append(text)
 
@@ -57,7 +57,7 @@ class Outcome:
         return self.told() == 'met'
 
     def told(self) -> str:
-        """'met', or what was not."""
+        """'met', or the unmet requirements."""
         texts = [f'{self.lost} lost'] if self.lost else []
         if (self.growth_mb or 0.0) > MOST_GROWTH:
             texts.append(f'wanted at most {MOST_GROWTH:g} MB')
@@ -71,18 +71,18 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Amount:
-    """How much of a case is to be done.
+    """Limits of a case.
 
     Attributes:
-        times: how often, if time allows.
-        seconds: that it may take.
+        times: maximum number of actions.
+        seconds: maximum duration, s.
     """
 
     times: int
     seconds: float
 
     def counted(self) -> Iterator[int]:
-        """Numbers from 0, until it is enough."""
+        """Numbers from 0 until a limit is reached."""
         end = time.monotonic() + self.seconds
         for number in range(self.times):
             yield number
@@ -90,13 +90,13 @@ class Amount:
                 return
 
     def part(self, share: float) -> Amount:
-        """A share of it."""
+        """A share of both limits."""
         return Amount(max(1, round(share * self.times)), share * self.seconds)
 
 
 @contextmanager
 def warnings_as_errors() -> Iterator[None]:
-    """What our code warns of is a fault; what libraries say of damaged pictures is nobody's."""
+    """Makes our warnings errors, and discards messages of libraries about damaged images."""
     with warnings.catch_warnings(), Path(os.devnull).open('w') as nothing:
         warnings.simplefilter('error', RuntimeWarning)
         sys.stderr.flush()
@@ -110,7 +110,7 @@ def warnings_as_errors() -> Iterator[None]:
 
 
 def place(error: BaseException) -> str:
-    """What was raised, and where in our code."""
+    """Type, place in our code, and text of an error."""
     frames = traceback.extract_tb(error.__traceback__)
     ours = [x for x in frames if any(name in x.filename for name in ('/hmt_ros/', '/msg_tools/'))]
     at = ours[-1] if ours else frames[-1]

@@ -1,4 +1,4 @@
-"""What each node is given in the soak: parameters, topics, and valid messages without end."""
+"""Scenes of the soak test: parameters, topics and endless valid messages for each node."""
 
 from __future__ import annotations
 
@@ -34,27 +34,27 @@ from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixt
 from msg_tools.messages.states import transforms_message
 
 PERSON = 'person_node'
-STEP_NS = 100_000_000  # between two messages
+STEP_NS = 100_000_000  # interval between two messages
 CLIP = ROOT / 'bags' / 'reach'
 _SMALL = TrackerSettings(max_hypotheses=2, candidates=4)
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A node and what it is fed with.
+    """A node and its messages.
 
     Attributes:
-        node: its name.
-        parameters: of the node.
-        session: what stands behind its topics.
+        node: name of the node.
+        parameters: parameters of the node.
+        session: class that processes its messages.
         inputs: topic and type by source.
-        sensors: topics on which data may be lost unless a player asks for better.
-        prelude: source and message of what has to come first.
-        pictures: messages of the source that sets the pace.
+        sensors: topics with best-effort delivery, unless a player asks for better.
+        prelude: source and message of each message that must come first.
+        pictures: messages of the counted source, which are repeated.
         others: a valid message of each other source.
-        start_ns: stamp of the first.
-        variants: other parameters, with which more of what comes is looked at.
-        together: nodes that run with it in one process; empty: it has one of its own.
+        start_ns: timestamp of the first message.
+        variants: other parameters, with which more inputs are used.
+        together: nodes that run in one process with this one; empty if it runs alone.
     """
 
     node: str
@@ -71,20 +71,20 @@ class Scene:
 
     @property
     def title(self) -> str:
-        """What runs: the node, or the process of several."""
+        """Name of the node, or of the process of several nodes."""
         return PERSON if self.together else self.node
 
     def message(self, index: int) -> Any:
-        """A message of the counted source; stamps grow with the index."""
+        """A message of the counted source; timestamps grow with the index."""
         picture = self.pictures[index_back_and_forth(index, len(self.pictures))]
         return stamped(picture, self.stamp(index))
 
     def stamp(self, index: int) -> int:
-        """Of a message, ns."""
+        """Timestamp of a message, ns."""
         return self.start_ns + index * STEP_NS
 
     def valid(self, image_transport: str = '') -> dict[str, Any]:
-        """A valid message of each source; images of the transport that is named."""
+        """A valid message of each source; images with the given transport."""
         message = self.message(0)
         if image_transport == 'raw':
             picture, header = decode_image(message), message.header
@@ -95,7 +95,7 @@ class Scene:
 
 
 def stamped(message: Any, stamp_ns: int) -> Any:
-    """The same message with another stamp; transforms have one each, and keep it."""
+    """The same message with another timestamp; transforms keep theirs."""
     if not hasattr(message, 'header'):
         return message
     header = header_message(RosbagsMessages(), stamp_ns, str(message.header.frame_id))
@@ -104,7 +104,7 @@ def stamped(message: Any, stamp_ns: int) -> Any:
 
 @cache
 def scenes() -> dict[str, Scene]:
-    """One of each node, and the filter in a process with others."""
+    """Scenes of all nodes, and of the filter in one process with others."""
     person = replace(_filter(), together=('filter_node', 'smoother_node'))
     return {scene.title: scene for scene in (_filter(), _smoother(), _bme(), _people(), person)}
 
@@ -144,7 +144,7 @@ def _filter() -> Scene:
             **{source: (f'/{source}', TRANSFORMS_TYPE) for source in TRANSFORMS},
         },
         (*_CAMERA_TOPICS, '/keypoints', '/mask'),
-        # A static transform keeps no image waiting.
+        # Images need not wait for a static transform.
         ((CAMERA_INFO, info), (TF_STATIC, _transform('world', frame, 0))),
         images,
         {
@@ -224,7 +224,7 @@ def _smoother() -> Scene:
 
 
 def _mixture(index: int, kind: MixtureKind) -> Any:
-    """Two modes of somebody who raises a forearm."""
+    """A mixture of two modes of a person who raises a forearm."""
     body = load_body('human37')
     means = np.tile(body.prior_mean, (2, 1))
     means[:, 2] = 4.0
@@ -259,7 +259,7 @@ def _keypoints(stamp_ns: int) -> Any:
 
 
 def _mask(image: Any) -> Any:
-    """A person in the middle of an image."""
+    """Mask of a person in the middle of an image."""
     mask = np.zeros(decode_image(image).shape[:2], np.uint8)
     mask[mask.shape[0] // 4 : -8, mask.shape[1] // 3 : -mask.shape[1] // 3] = 255
     stamp, frame = time_ns(image.header.stamp), str(image.header.frame_id)

@@ -1,4 +1,4 @@
-"""A node in a process of its own that the soak feeds, asks and listens to over DDS."""
+"""A node in its own process that the soak test feeds, calls and monitors over DDS."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from hmt_ros.nodes.subscribed_topic import message_class
 from hmt_ros.sessions.handled import Handled
 
 OURS = '/hmt_ros/'
-# How long one message may take, s.
+# Maximum time to answer one message, s.
 PATIENCE = 30.0
-# How long a node may take to start, and a case beyond its time, s.
+# Maximum time for the start of a node, and maximum overtime of a case, s.
 _START, _OVERTIME = 300.0, 90.0
-# How long a valid message is waited for that may have been sent too early, s.
+# Maximum wait for the answer to a message that may have been sent too early, s.
 SHORT = 2.0
-# Messages of a topic that wait for this process. While it is late it publishes on without
-# listening: answers beyond these would be lost here, though the node has given them.
+# Queue size of this process for each topic. While it is late it publishes without listening, so
+# answers beyond these would be lost here, although the node has sent them.
 _QUEUE = 1000
-# Good answers in a row after which a session has begun: more than have to agree on a clock.
+# Number of consecutive good answers that confirm a session, above that for a clock change.
 _AGREEING = 4
-# Messages before memory is compared: buffers have grown.
+# Number of messages before memory is compared, so that buffers have grown.
 _WARM = 8
 
 
 class Silent(Exception):
-    """Nothing was heard in time."""
+    """No answer was received in time."""
 
 
 class _Limited:
-    """An executor in which nothing is waited for when time is over; all waits of a case spin it."""
+    """An executor that raises an error when the time is over; all waits of a case spin it."""
 
     def __init__(self, executor: Any, end: float) -> None:
         self._executor = executor
@@ -50,10 +50,10 @@ class _Limited:
 
 
 class Watched:
-    """A node that runs, what it publishes, and what it says.
+    """A running node, with its published messages and its log.
 
     Args:
-        scene: of the node.
+        scene: scene of the node.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -63,11 +63,11 @@ class Watched:
         self.restart()
 
     def limit(self, seconds: float) -> None:
-        """Begins a case, whose waits end so much later at the latest, and some time beyond."""
+        """Begins a case, whose waits end after `seconds` and some overtime at the latest."""
         self._end = self.player.executor.end = time.monotonic() + seconds + _OVERTIME
 
     def restart(self) -> None:
-        """Starts it, in a domain of its own; ends the one that ran before."""
+        """Starts the node in a new domain, and ends the previous one."""
         self._opened.close()
         self.index = 0
         self._setting: Any = None
@@ -110,26 +110,26 @@ class Watched:
         self._opened.close()
 
     def warm_up(self) -> None:
-        """Until all is loaded; after that memory is compared."""
+        """Sends messages until everything is loaded, so that memory can be compared."""
         for source, message in self.scene.prelude:
             self.send(source, message)
         for _ in range(_WARM):
             self.next()
 
     def send(self, source: str, message: Any) -> Handled:
-        """A message in lock step; what became of it."""
+        """Sends a message and waits for its answer."""
         self.node.publish(source, message)
         return self.node.answer(source, PATIENCE)
 
     def next(self) -> Handled:
-        """The next valid message in lock step."""
+        """Sends the next valid message and waits for its answer."""
         self.index += 1
         return self.send(self.scene.session.COUNTED, self.scene.message(self.index - 1))
 
     def begin_again(self) -> None:
-        """Valid messages from the first on, until some in a row are used: a session has begun.
+        """Sends valid messages from the first one until several in a row are used.
 
-        The first ones after a step back of the clock wait until others agree with them.
+        After the clock is set back, the first messages wait until later ones agree with them.
         """
         self.index = good = 0
         end = time.monotonic() + PATIENCE
@@ -147,10 +147,10 @@ class Watched:
         self.settle()
 
     def answer(self, seconds: float) -> Handled:
-        """What became of a message.
+        """The answer to a message.
 
         Raises:
-            Silent: nothing is heard.
+            Silent: there is no answer in time.
         """
         end = time.monotonic() + seconds
         while not self.node.has_answered:
@@ -161,7 +161,7 @@ class Watched:
         return self.node.answer('message', PATIENCE)
 
     def settle(self, seconds: float = 0.5) -> list[Handled]:
-        """What it tells of messages, until it is silent for a while."""
+        """Collects answers until the node is silent for some time."""
         found = []
         with suppress(Silent):
             while True:
@@ -169,14 +169,14 @@ class Watched:
         return found
 
     def check_alive(self) -> None:
-        """Raises LiveNodeError where the process has ended."""
+        """Raises LiveNodeError if the process has ended."""
         code = self.node.process.poll()
         if code is not None:
             words = self.node.output().strip().splitlines()[-1:]
             raise LiveNodeError(f'{self.scene.node} ended with code {code}: {" ".join(words)}')
 
     def change(self, transition: int) -> bool:
-        """Whether a transition has been made."""
+        """Requests a transition; returns whether it was made."""
         from lifecycle_msgs.msg import Transition
         from lifecycle_msgs.srv import ChangeState
 
@@ -184,13 +184,13 @@ class Watched:
         return bool(self.node.call(ChangeState, 'change_state', transition=asked).success)
 
     def state(self) -> int:
-        """Number of the state of its lifecycle."""
+        """Number of the node's lifecycle state."""
         from lifecycle_msgs.srv import GetState
 
         return int(self.node.call(GetState, 'get_state').current_state.id)
 
     def set(self, **values: Any) -> tuple[bool, str]:
-        """Sets parameters all at once; whether that was done, and why not."""
+        """Sets parameters atomically; returns whether that succeeded, and the reason if not."""
         from rcl_interfaces.srv import SetParametersAtomically
         from rclpy.parameter import Parameter
 
@@ -201,7 +201,7 @@ class Watched:
         return bool(found.successful), str(found.reason)
 
     def begin_to_set(self, **values: Any) -> Any:
-        """Sends a request to set parameters; its answer comes as a future."""
+        """Sends a request to set parameters; returns a future."""
         from rcl_interfaces.srv import SetParameters
         from rclpy.parameter import Parameter
 
@@ -221,7 +221,7 @@ class Watched:
         return [parameter_value_to_python(value) for value in found]
 
     def values(self) -> dict[str, str]:
-        """The values of its next diagnostics."""
+        """The values of the node's next diagnostics."""
         diagnostics = self.player.diagnostics
         diagnostics.pop(self.node.name, None)
         end = time.monotonic() + PATIENCE
@@ -233,10 +233,10 @@ class Watched:
         return diagnostics[self.node.name]
 
     def traces(self) -> list[str]:
-        """What it has said that no user should see.
+        """Lines of the log that no user should see.
 
-        An executor of rclpy shows where a callback failed: that of rclpy itself for /clock does
-        where time is below zero.
+        The executor of rclpy logs failures of callbacks, such as its own one for /clock if the
+        time is negative.
         """
         lines = [
             line
@@ -254,11 +254,11 @@ class Watched:
         ]
 
     def spin(self, seconds: float) -> None:
-        """Listens for a while."""
+        """Listens for some time."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             self.player.executor.spin_once(timeout_sec=left)
 
 
 def _ignored(topic: str, stamp: int, data: bytes) -> None:
-    """That it has come is enough."""
+    """Ignores the content; only the arrival counts."""

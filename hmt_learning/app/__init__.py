@@ -17,5 +17,5 @@ ABOUT = 'Rendering and learning for hmt_ros, from motion files.'
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs a command; 0: done, 1: bad input, which one line on stderr explains."""
+    """Runs a command; returns 0, or 1 after bad input, which one line on stderr explains."""
     return run_program('hmt_learning', COMMANDS, ABOUT, argv=argv)

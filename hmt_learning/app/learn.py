@@ -74,9 +74,9 @@ from hmt_ros.inference.arrays import Array, Index
 
 Item = TypeVar('Item')
 
-# Number of frames of a motion that its lengths are measured on.
+# Approximate number of frames from which the lengths of a motion are measured.
 FRAMES = 60
-# Largest accepted relative difference of a motion's rate from that of the poses.
+# Maximum relative difference between the frame rates of a motion and of the poses.
 SAME_RATE = 0.01
 
 
@@ -86,13 +86,13 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _parser() -> CommandParser:
-    parser = CommandParser('learn', 'Learns from motion files what the tracker knows of people.')
+    parser = CommandParser('learn', "Learns the tracker's models of people from motion files.")
     what = parser.add_subparsers(required=True, metavar='WHAT', dest='what')
     parsers = {}
     for name, work, text in (
-        ('lengths', _lengths, 'how lengths vary over people, from the skeletons of the files'),
-        ('lifter', _lifter, 'experts that tell the depths of joints from windows of keypoints'),
-        ('motion', _motion, 'how the poses of a body move'),
+        ('lengths', _lengths, 'the distribution of segment lengths over people'),
+        ('lifter', _lifter, 'experts that estimate the depths of joints from windows of keypoints'),
+        ('motion', _motion, 'the motion prior of a body'),
         ('prior', _prior, 'the prior of the joint angles'),
     ):
         parsers[name] = what.add_parser(name, help=text, description=f'Learns {text}.')
@@ -133,18 +133,18 @@ def _add_lifter(parser: CommandParser) -> None:
         '--start-from',
         type=Path,
         metavar='LIFTER',
-        help='lifter to learn on from, with fewer steps and a lower rate (from nothing)',
+        help='lifter from which to continue, with fewer steps and a lower rate (default: none)',
     )
     parser.add_argument(
         '--rate',
         type=number(0.0, 1.0),
         default=usual.rate,
-        help=f'highest rate of the descent ({usual.rate:g})',
+        help=f'maximum learning rate ({usual.rate:g})',
     )
     parser.add_argument(
         '--resume',
         action='store_true',
-        help='continue a training that was interrupted, marked beside FILE as FILE.resume',
+        help='continue an interrupted training, recorded in FILE.resume',
     )
 
 
@@ -208,7 +208,7 @@ def _motion(arguments: argparse.Namespace) -> int:
     card = data_card(sequences, arguments.acknowledgement)
     with show_progress('learning', quiet=quiet):
         model = learned_motion(body, [one.poses for one in sequences], RATE, card)
-    # At rest.
+    # The state at rest.
     example = np.zeros(model.dynamics.state_dimension)
     write_model(output, model, LearnedMotion.from_arrays, model.card, example)
     if not quiet:
@@ -220,7 +220,7 @@ def _motion(arguments: argparse.Namespace) -> int:
 
 
 def _at_rate(path: Path, body: Body) -> PoseSequence:
-    """The motion in a file, whose rate has to be that of the poses, or a multiple."""
+    """The motion in a file; its frame rate must be RATE or a multiple of it."""
     fps = read_motion(path).fps
     rate = fps / max(round(fps / RATE), 1)
     if abs(rate / RATE - 1.0) > SAME_RATE:
@@ -232,7 +232,7 @@ def _lifter(arguments: argparse.Namespace) -> int:
     output, quiet = model_file(arguments.output, overwrite=arguments.overwrite), arguments.quiet
     mark = output.with_suffix('.resume')
     if mark.exists() and not arguments.resume:
-        raise ValueError(f'{mark} marks a training that was broken off: --resume, or remove it')
+        raise ValueError(f'{mark} records an interrupted training: give --resume, or remove it')
     taught = None if arguments.start_from is None else Lifter.load(arguments.start_from)
     check_tools()
     body = load_body(arguments.body)

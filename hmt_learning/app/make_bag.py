@@ -38,12 +38,12 @@ from hmt_ros.app.command_line import (
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.inference.arrays import Array
 
-DURATION, HEADING = 4.0, 30.0  # s; degrees, of recorded motions
+DURATION, HEADING = 4.0, 30.0  # default duration, s; default heading of recorded motions, degrees
 
 
 @dataclass(frozen=True)
 class MotionOptions:
-    """Arguments of the command that choose the motion, see its help."""
+    """Arguments that select the motion; see the help of the command."""
 
     name: str
     mocap: Path | None
@@ -57,7 +57,7 @@ class MotionOptions:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; 0: the bag is there, 1: bad input, which one line on stderr explains."""
+    """Runs the command; returns 0, or 1 after bad input, which one line on stderr explains."""
     return run_command(_parser(), _make_bag, argv)
 
 
@@ -142,7 +142,7 @@ def _parser() -> CommandParser:
         '--noise',
         type=number(0, 100),
         default=2.5,
-        help='standard deviation of the noise of a pixel, grey levels of 255 (default: 2.5)',
+        help='standard deviation of the pixel noise, grey levels of 255 (default: 2.5)',
     )
     camera.add_argument(
         '--shadow',
@@ -216,10 +216,10 @@ def _body(name: str) -> Body:
 
 
 def motion_of(options: MotionOptions, viewpoint: Viewpoint) -> Take:
-    """The motion that options choose, before a camera.
+    """The motion selected by options, in front of a camera.
 
     Raises:
-        ValueError: options that do not go together, or a file that can not be used.
+        ValueError: options contradict each other, or a file can not be used.
     """
     body = _body(options.body)
     heading = None if options.heading is None else math.radians(options.heading)
@@ -271,12 +271,12 @@ def _recorded(
 def _placed(
     motion: Motion, heading: float, ankle_height: float, viewpoint: Viewpoint
 ) -> tuple[Array, Array]:
-    """Rotation and translation from the world of a motion to the camera.
+    """Rotation and translation from the world frame of a motion to the camera frame.
 
-    The middle of the motion moves to the origin of the viewpoint; the person first faces `heading`.
+    The middle of the motion is at the viewpoint's origin; the person first faces `heading`.
     """
     hips = motion.joint_positions(['left_hip', 'right_hip'])[0]
-    x, y = (hips[1] - hips[0])[:2]  # to the right of the person, who looks to (-y, x)
+    x, y = (hips[1] - hips[0])[:2]  # to the person's right; the person faces (-y, x)
     turn = heading - math.atan2(y, x)
     c, s = math.cos(turn), math.sin(turn)
     rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

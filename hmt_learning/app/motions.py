@@ -1,4 +1,4 @@
-"""Motions that a command learns from: its arguments, the files, and whose motion each is."""
+"""Motions for a command that learns: arguments, files, and the person of each motion."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def add_sources(parser: argparse._ActionsContainer) -> None:
         nargs='+',
         default=[],
         metavar='NAME',
-        help='motions to leave out, names of files without suffix; * stands for any letters',
+        help='motions to leave out: names of files without suffix, * stands for any letters',
     )
     parser.add_argument(
         '--acknowledgement',
@@ -90,7 +90,7 @@ def add_test(parser: argparse._ActionsContainer) -> None:
         nargs='+',
         default=[],
         metavar='MOTION',
-        help='motions of other people, or folders of them, to score on',
+        help='motions of other people, or folders of them, for testing',
     )
 
 
@@ -100,14 +100,14 @@ def add_alike(parser: argparse._ActionsContainer) -> None:
         '--alike',
         default='',
         metavar='PREFIX',
-        help='motions whose names start with it are few exercises, each done many times',
+        help='prefix of the names of motions that are few exercises, each done many times',
     )
     parser.add_argument(
         '--alike-share',
         type=number(0.0, 1.0),
         default=0.35,
         metavar='SHARE',
-        help='factor on how often these are drawn (0.35)',
+        help='factor on the probability that these are drawn (0.35)',
     )
 
 
@@ -125,10 +125,10 @@ def add_people_tables(parser: argparse._ActionsContainer) -> None:
 
 
 def model_file(output: Path, *, overwrite: bool) -> Path:
-    """The file of a model, with '.npz' where that is missing.
+    """Path of a model file, with '.npz' appended if missing.
 
     Raises:
-        ValueError: it exists and is not to be overwritten, or its folder does not.
+        ValueError: the file exists without `overwrite`, or its folder does not exist.
     """
     if output.suffix != '.npz':
         output = output.with_name(output.name + '.npz')
@@ -137,10 +137,10 @@ def model_file(output: Path, *, overwrite: bool) -> Path:
 
 
 def chosen_motions(motions: list[Path], without: list[str]) -> list[Path]:
-    """Motion files, and those in folders, but some names of files without suffix (cmu_02_*).
+    """Motion files given directly or in folders, except some names without suffix (cmu_02_*).
 
     Raises:
-        ValueError: a file that is no motion, a folder without any, or a name of none of them.
+        ValueError: a file is no motion, a folder has none, or an exception matches no file.
     """
     found: list[Path] = []
     for path in motions:
@@ -168,16 +168,16 @@ def read_motions(
     *,
     quiet: bool = False,
 ) -> list[Item]:
-    """Content of motions, for a body; a line on stderr for each that can not be used.
+    """Reads motions for a body; one line on stderr for each unusable file.
 
     Args:
-        read: reads one; errors of input and of arithmetic say that it can not be used.
+        read: reads one motion; input and arithmetic errors mark it as unusable.
 
     Raises:
         ValueError: there are motions, and none can be used.
     """
     found = []
-    # Not by a fork: threads of other libraries may run in this process.
+    # Not fork, because threads of other libraries may run in this process.
     context = get_context('spawn')
     with ProcessPoolExecutor(min(os.cpu_count() or 1, 8), context) as pool:
         reading = pool.map(partial(_read_one, read=read, body=body), paths, chunksize=2)
@@ -201,15 +201,15 @@ def _read_one(path: Path, read: Callable[[Path, Body], Item], body: str) -> tupl
 
 
 def person_of(name: str, owners: dict[str, str]) -> str:
-    """The person of a motion file, by `people_in`, or else by its name without suffix."""
+    """The person of a motion file, from `people_in`, otherwise the first two words of its name."""
     return owners.get(name) or '_'.join(name.split('_')[:2])
 
 
 def people_in(tables: Iterable[Path]) -> dict[str, str]:
-    """The person of each motion file, by the name of the file without folder and suffix.
+    """The person of each motion file, keyed by the file's name without folder and suffix.
 
     Raises:
-        ValueError: a table without the columns file and subject; one line.
+        ValueError: a table can not be read or lacks the columns file and subject.
     """
     found: dict[str, str] = {}
     for path in tables:
@@ -224,18 +224,18 @@ def people_in(tables: Iterable[Path]) -> dict[str, str]:
         places = columns.index('file'), columns.index('subject')
         for row in rows:
             file, subject = (row[i] if i < len(row) else '' for i in places)
-            # A question mark: the person was guessed.
+            # A question mark says that the person was guessed.
             found[Path(file).stem] = subject.rstrip('?')
     return found
 
 
 def shares_of(sequences: list[PoseSequence], alike: str, share: float) -> list[float]:
-    """How often each motion is drawn: those whose names start with `alike` less often."""
+    """Relative frequency of each motion: `share` if its name starts with `alike`, otherwise 1."""
     return [share if alike and one.name.startswith(alike) else 1.0 for one in sequences]
 
 
 def data_card(sequences: list[PoseSequence], acknowledgement: str) -> dict[str, Any]:
-    """The card of a file that is learned from motions, by heading."""
+    """Data card of a file learned from motions, by heading."""
     return {
         'source': acknowledgement.strip(),
         'motions': sorted(one.name for one in sequences),

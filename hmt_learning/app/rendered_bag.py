@@ -4,7 +4,7 @@ The bag has the topics `/image/compressed`, `/camera_info`, `/ground_truth` (hmt
 and `/body` (hmt_msgs/Body, latched), and `/depth` (sensor_msgs/Image, 16UC1) on request. Its folder
 also has the files that replay and evaluate need: `background.png` (the empty scene), `subject.yaml`
 (joints as clicked in the first image) and `truth.npz` (joints, pixels, silhouettes, gravity and the
-height of the camera). `/tf_static` tells where the camera is in `odom`, as a robot would.
+height of the camera). `/tf_static` has the camera's pose in `odom`, as on a robot.
 
 A bag of several people, such as two who walk past each other, has instead of `/ground_truth` and
 `/body` the topics `/humans/bodies/a/ground_truth`, `.../b/ground_truth` and `/detections`
@@ -48,12 +48,12 @@ from msg_tools.messages.images import compressed_image_message, depth_message
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 from msg_tools.messages.states import transforms_message
 
-# The world, z up and 0 on the floor.
+# World frame; z points up and is 0 on the floor.
 WORLD = 'odom'
-# Each of two people has a file of the truth.
+# Files in the folder of a bag; with two people each has a truth file.
 FILES_BESIDE = ('background.png', 'subject.yaml', 'truth.npz', 'truth_a.npz', 'truth_b.npz')
 CLICK_SIGMA = 2.0  # px
-OF_CLICKS = 5  # stream of random numbers of a seed; `hmt_ros.image` uses others
+OF_CLICKS = 5  # identifier of a random stream; `hmt_ros.image` uses others
 TAPE = 0.005  # resolution of the measured lengths of a subject, m
 MEASURED = (
     'thigh',
@@ -70,15 +70,15 @@ MEASURED = (
 
 CROSSING = 'crossing'
 PEOPLE = ('a', 'b')
-# Distance by which one walks before the other, m; largest turn of each from straight across.
+# Difference in depth of the two people, m; maximum angle to the image plane of each walk, rad.
 BEFORE = 0.9
 TURN = np.radians(12.0)
-# Statures, as a share of the model's.
+# Range of statures, as factors on the model's.
 STATURES = (0.94, 1.06)
-# Noise of the keypoints, m on the person; their confidence; fewest that are a detection.
+# Noise of keypoints, m on the person; their confidence; minimum number for a detection.
 NOISE, CONFIDENCE = 0.02, 0.9
 FEWEST = 5
-OF_PEOPLE, OF_DETECTIONS = 6, 7  # streams of random numbers of a seed
+OF_PEOPLE, OF_DETECTIONS = 6, 7  # identifiers of random streams
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class Take:
     fps: float
 
     def stamp_ns(self, frame: int) -> int:
-        """Stamp of an image."""
+        """Timestamp of an image, ns."""
         return START_NS + round(frame * SECOND_NS / self.fps)
 
 
@@ -111,7 +111,7 @@ def write_bag(
     with_depth: bool = False,
     progress: bool = False,
 ) -> None:
-    """Renders a motion into a new bag folder, with its files beside.
+    """Renders a motion into a new bag folder and adds the other files.
 
     Args:
         folder: new folder; its name becomes that of the bag.
@@ -189,7 +189,7 @@ def _write_truth(
 def write_camera_place(
     bag: BagWriter, messages: RosbagsMessages, viewpoint: Viewpoint, stamp_ns: int
 ) -> None:
-    """Writes where a camera stands in `WORLD`, on /tf_static."""
+    """Writes the pose of a camera in `WORLD` to /tf_static."""
     rotation, position = viewpoint.rotation.T, viewpoint.to_world(np.zeros(3))
     place = transforms_message(
         messages, [WORLD], [FRAME_ID], rotation[None], position[None], stamp_ns
@@ -199,7 +199,7 @@ def write_camera_place(
 
 
 def true_gravity(viewpoint: Viewpoint) -> Array:
-    """Its direction (3,) in the frame of a camera."""
+    """Direction (3,) of gravity in the camera frame."""
     return np.asarray(viewpoint.rotation @ np.array([0.0, 0.0, -1.0]))
 
 
@@ -254,7 +254,7 @@ def subject_text(take: Take, camera: Camera, pixels: Array, seed: int) -> str:
 
 
 def new_bag_folder(target: Path, *, overwrite: bool) -> AbstractContextManager[Path]:
-    """A folder for the bag, which replaces the target when all is written, or never."""
+    """New folder for the bag; it replaces the target only after everything is written."""
     files = (f'{target.absolute().name}.mcap', *FILES_BESIDE)
     return FolderKind('a bag', 'metadata.yaml', files).new(target, overwrite=overwrite)
 
@@ -262,7 +262,7 @@ def new_bag_folder(target: Path, *, overwrite: bool) -> AbstractContextManager[P
 def crossing_takes(
     body: Body, duration: float, fps: float, seed: int, viewpoint: Viewpoint
 ) -> list[Take]:
-    """The motions of two people who cross in the middle of the image at half the time."""
+    """Motions of two people whose paths cross in the middle of the image at half time."""
     rng = np.random.default_rng([seed, OF_PEOPLE])
     first = rng.choice([-1.0, 1.0])
     takes = []
@@ -336,8 +336,8 @@ def detection(
     """COCO keypoints of a person as a detector would see them.
 
     Args:
-        body, pose: the person, pose (d,).
-        own: (H, W) pixels that show the person.
+        body, pose: body and pose (d,) of the person.
+        own: (H, W) mask of the pixels that show the person.
     """
     scheme, skeleton = schemes()['coco17'], body.skeleton
     marks = [x for x in zip(scheme.names, scheme.landmarks, strict=True) if x[1].joint]
@@ -348,7 +348,7 @@ def detection(
     points = frames.points(skeleton.joint_segments[at], local)[:, :, 0]
     exact = camera.project(points)
     pixels = exact + rng.normal(0.0, NOISE, exact.shape) * (camera.fx / points[:, 2:])
-    # A keypoint on the edge of the person belongs to it.
+    # A keypoint on the outline of the person is visible.
     near = cv2.dilate(own.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     column, row = np.nan_to_num(np.round(exact), nan=-1.0).astype(int).T
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)

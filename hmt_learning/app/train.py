@@ -65,11 +65,11 @@ from msg_tools.files.new_folder import new_file
 Item = TypeVar('Item')
 
 PROCEDURAL_SEEDS, PROCEDURAL_SECONDS = 5, 12.0
-# Silhouettes that a predictor is scored on, and components of a prediction.
+# Number of silhouettes for the scores, and of predicted components for the best-of score.
 TESTED, BEST_OF = 1000, 5
 # Figures of the training set: affinities (BME fig. 7), multimodality (BME fig. 6), examples.
 ACTIVITIES = 3  # maximum number of activities whose affinities are drawn
-FRAMES = 120  # maximum number of frames of each
+FRAMES = 120  # maximum number of frames per activity
 ANALYSED = 2000  # maximum number of samples whose multimodality is counted
 FINE, COARSE = 0.956, 0.70  # clusters per sample, as in the paper: 1912 and 1409 of 2000
 EXAMPLES = (4, 12)  # rows and columns of silhouettes
@@ -115,7 +115,7 @@ def _parser() -> CommandParser:
         '--model',
         choices=sorted(KINDS),
         default='network',
-        help='model that learns; network, the default, needs jax and optax',
+        help='kind of model; network, the default, needs jax and optax',
     )
     learning.add_argument(
         '--experts',
@@ -221,7 +221,7 @@ def _sequences(options: argparse.Namespace, body: Body) -> tuple[list[PoseSequen
 
 
 def _scores(predictor: PosePredictor, tested: list[PoseSequence]) -> str:
-    """Scores on silhouettes of other people, seen as those that were learned from, as text."""
+    """Scores on silhouettes of other people, rendered like the training set, as text."""
     body, descriptor = predictor.body, predictor.descriptor
     pairs = training_set(body, tested, TrainingSettings(samples=TESTED))
     rows = descriptor.describe([pairs.parts(i, descriptor.points) for i in range(len(pairs))])
@@ -294,7 +294,7 @@ def _affinity_figure(body: Body, sequences: Sequence[PoseSequence], training: De
         axes = figure.subplots(len(chosen), len(columns), squeeze=False)
         for number, sequence in enumerate(chosen):
             row = axes[number]
-            # The person on average looks across the image; long motions have half the rate.
+            # The person on average faces across the image; long motions are shown at half the rate.
             step = 2 if len(sequence.poses) >= 2 * FRAMES else 1
             poses, masks = seen_from(body, sequence, 90.0, frames=slice(0, FRAMES * step, step))
             parts = [silhouette_parts(mask, training.descriptor.points) for mask in masks]

@@ -1,1 +1,1 @@
-"""Motion files, retargeting to our bodies, and procedural motion."""
+"""Motion files, retargeting to the body models, and procedural motion."""

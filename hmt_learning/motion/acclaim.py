@@ -28,7 +28,7 @@ from hmt_learning.motion.rig import (
 )
 from hmt_ros.inference.arrays import Array
 
-INCH = 0.0254  # m; CMU's `length 0.45` means inches times 0.45
+INCH = 0.0254  # m; with CMU's `length 0.45` a file unit is 1 / 0.45 inch
 CHANNELS = {
     f'{kind}{letter}': (axis, kind == 'r') for kind in 'tr' for axis, letter in enumerate('xyz')
 }
@@ -53,8 +53,8 @@ class Acclaim:
     Attributes:
         rig: the skeleton, angles in rad.
         unit_to_m: metres per unit of length.
-        degrees: whether angles are in degrees where the AMC does not tell.
-        columns: for each bone the positions in the rig's order of the numbers of its AMC line.
+        degrees: whether angles are in degrees if the AMC does not declare a unit.
+        columns: by bone, the channel indices in the rig of the numbers on its AMC line.
         dimension: number of channels.
     """
 
@@ -121,7 +121,7 @@ def read_amc(path: Path, text: str, skeleton: Acclaim) -> Array:
 
 
 def _frames(path: Path, lines: Sequence[str], at: int, skeleton: Acclaim) -> Array:
-    """The values (T, d) of the frames from a line on."""
+    """Values (T, d) of all frames, starting at line `at`."""
     frames: list[Array] = []
     missing: set[str] = set()
     first_frame = 0
@@ -164,7 +164,7 @@ Lines = list[tuple[int, list[str]]]
 
 
 def _sections(path: Path, text: str) -> dict[str, Lines]:
-    """Lines of each `:keyword`, with numbers, in words without comments."""
+    """Numbered lines of each `:keyword` section, split into words, without comments."""
     result: dict[str, Lines] = {}
     current: Lines | None = None
     number = 0
@@ -304,7 +304,7 @@ def _order(path: Path, line: int, words: Sequence[str]) -> str:
 
 
 def _hierarchy(path: Path, lines: Lines, bones: dict[str, _Bone]) -> list[str]:
-    """Sets the parents; bones in an order with parents before children."""
+    """Sets the parents, and returns the bone names with parents before children."""
     order = {'root': 0}
     for line, words in lines:
         if words in (['begin'], ['end']):
@@ -342,7 +342,7 @@ def _acclaim(bones: dict[str, _Bone], order: list[str], length: float, degrees: 
             offset, mount = before @ _span(bones[bone.parent]), before @ axes[name]
         else:
             parent, offset, mount = -1, bone.position, axes[name]
-        # In a product of rotations the one that is applied first stands last.
+        # In a product of rotations, the one that is applied first is the last factor.
         ranks = {'t': -3, **{letter: -i for i, letter in enumerate(bone.order)}}
         acting = sorted(bone.dofs, key=lambda dof: ranks['t' if dof[0] == 't' else dof[1]])
         channels = []
@@ -367,7 +367,7 @@ def _span(bone: _Bone) -> Array:
 
 
 def _rotation(order: str, angles: Array) -> Array:
-    """Rotation about the fixed axes x, y, z, one after the other in this order of letters."""
+    """Rotation about the fixed axes x, y, z, applied in the order of the letters."""
     result = np.eye(3)
     for letter in order:
         axis = 'xyz'.index(letter)

@@ -1,10 +1,10 @@
-"""BVH, the motion file of Biovision: a hierarchy of joints, and one line of numbers a frame.
+"""BVH, the motion file of Biovision: a hierarchy of joints, and one line of numbers per frame.
 
     position of a joint = its parent's frame * (OFFSET + position channels)
     rotation of a joint = its parent's rotation * Rot(first channel) * Rot(second) * ...
 
-Programs differ in whether position channels stand instead of OFFSET or add to it. Here the numbers
-decide, joint by joint: where their median reaches beyond the middle of OFFSET, they stand instead.
+In some programs position channels replace OFFSET, in others they add to it. This is decided for
+each joint: if their median reaches more than half of OFFSET, they replace it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hmt_learning.motion.rig import (
 )
 from hmt_ros.inference.arrays import Array
 
-_MOST_WORDS = 20_000  # in a line; the time that they take is quadratic
+_MOST_WORDS = 20_000  # maximum number of words in a line, because parsing time is quadratic
 _LONGEST_NAME = 200  # characters
 CHANNELS = {
     f'{letter}{kind}': (axis, kind == 'rotation')
@@ -36,7 +36,7 @@ CHANNELS = {
 
 
 def read_bvh(path: Path, text: str) -> tuple[Rig, Array, float]:
-    """Skeleton, channels (T, d) in the rig's order, degrees and file units, and seconds a frame.
+    """Skeleton, channels (T, d) in the rig's order, degrees and file units, and frame time, s.
 
     Raises:
         MotionFileError: the text is not a complete BVH.
@@ -50,7 +50,7 @@ def read_bvh(path: Path, text: str) -> tuple[Rig, Array, float]:
 
 @dataclass(eq=False)
 class _Joint:
-    """A joint while its braces are open; a tip has no channels and is marked."""
+    """A joint of the file; a tip (End Site) has no channels."""
 
     name: str
     parent: int
@@ -147,7 +147,7 @@ def _channels(path: Path, line: int, words: list[str], joint: _Joint) -> list[st
 
 
 def _motion(path: Path, lines: list[str], at: int, count: int) -> tuple[Array, float]:
-    """Values (T, count) in the file's order and seconds a frame, from the line after MOTION."""
+    """Values (T, count) in the file's order and frame time, s, from the line after MOTION."""
     header: list[tuple[int, str]] = []
     while at < len(lines) and len(header) < 2:
         if lines[at].strip():
@@ -188,7 +188,7 @@ def _motion(path: Path, lines: list[str], at: int, count: int) -> tuple[Array, f
 
 
 def _rig(path: Path, joints: list[_Joint], values: Array) -> tuple[Rig, Array]:
-    """The rig, and its channels' values: translations first, constant ones as offsets."""
+    """The rig and its channels' values; translations come first, constant ones become offsets."""
     segments: list[RigSegment] = []
     tips: list[RigJoint] = []
     place: dict[int, int] = {}  # joint -> segment
@@ -213,7 +213,7 @@ def _rig(path: Path, joints: list[_Joint], values: Array) -> tuple[Rig, Array]:
         middle = np.zeros(3)
         middle[shift_axes] = np.median(moved, axis=0) if shifts else 0.0
         if middle @ offset > 0.5 * (offset @ offset) > 0:
-            moved = moved - offset[shift_axes]  # the channels stand instead of OFFSET
+            moved = moved - offset[shift_axes]  # the channels replace OFFSET
         if parent >= 0 and shifts and np.all(moved == moved[0]):
             offset[shift_axes] += moved[0]
             shifts, shift_axes, moved = [], [], moved[:, :0]

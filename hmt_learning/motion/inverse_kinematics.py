@@ -1,7 +1,7 @@
-"""Iterative inverse kinematics: poses that put joints where they should be (KJS 3.2).
+"""Iterative inverse kinematics: poses that move joints to target positions (KJS 3.2).
 
-Bounded damped Newton on the squared distances of the joints to their targets, with the hard limits
-and the soft prior. Procedural motions take their arms and legs from it.
+Bounded damped Newton minimises the squared distances of the joints from their targets, with hard
+limits and the soft prior. Procedural motions use it for arms and legs.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ def solve_joint_positions(
         1/2 sum |joint - target|^2 / sigma^2 + prior_weight / 2 sum ((x - mean) / prior sigma)^2.
 
     Args:
-        poses: (N, d) starts.
-        targets: (N, J', 3) camera frame, m; NaN for a joint without a target.
+        poses: (N, d) initial poses.
+        targets: (N, J', 3) target positions, camera frame, m; NaN for a joint without a target.
         joint_names: (J',) names of the joints of the targets; None selects all joints.
         sigma: standard deviation of the targets, scalar, (J',) or (N, J'), m.
         free_dofs: names of the degrees of freedom that may change; None selects all.
-        along_rays: whether only the distance of a joint from the ray of its target counts.
+        along_rays: whether to use only the distance of a joint from the ray through its target.
     """
     skeleton = body.skeleton
     names = skeleton.joint_names if joint_names is None else tuple(joint_names)

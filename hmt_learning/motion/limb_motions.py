@@ -1,8 +1,8 @@
-"""Arms and feet of synthetic motions: postures that reach, and a foot that stands or walks.
+"""Arms and feet of synthetic motions: reaching postures, and standing or walking feet.
 
-Directions and places of arms are those of a person at rest: x to the person's right, y ahead, z up.
-Feet are in the world of a `Viewpoint`: z up, floor at z = 0, m. A heading of 0 faces the camera;
-positive is to the person's left.
+Directions and positions of arms are in the frame of the person: x to the right, y ahead, z up.
+Feet are in the world frame of a `Viewpoint`: z up, floor at z = 0, m. A heading of 0 faces the
+camera; positive headings turn to the person's left.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from hmt_ros.inference.arrays import Array
 
 Posture = dict[str, float]  # degree of freedom -> rad
 
-SIGNS = np.array([-1.0, 1.0])  # of x, outwards
+SIGNS = np.array([-1.0, 1.0])  # signs of x outwards, for the left and the right side
 ARM_DOFS = ('shoulder_x', 'shoulder_y', 'shoulder_z', 'elbow')
-REACHED = 0.012  # largest distance of elbows and wrists from their targets, m
-STRETCH = 0.45, 0.97  # bounds of the distance of a wrist from its shoulder, in lengths of an arm
+REACHED = 0.012  # maximum distance of elbows and wrists from their targets, m
+STRETCH = 0.45, 0.97  # bounds of the distance from wrist to shoulder, in arm lengths
 CANDIDATES, TRIES = 24, 20
-# A stride, in shares of its time, from one strike of the heel to the next.
-BODY_ABOVE = 0.235  # the body passes the foot
+# Phases of a stride, as fractions of the time from one heel strike to the next.
+BODY_ABOVE = 0.235  # the body passes over the foot
 HEEL_OFF, TOE_OFF = 0.30, 0.62
-STRIKE, PUSH = np.radians(16.0), np.radians(-56.0)  # pitch of the foot, toe up
-CLEARANCE = 0.02  # added to the arc of the ankle in the air, m of a body of the default size
+STRIKE, PUSH = np.radians(16.0), np.radians(-56.0)  # pitch of the foot, positive with the toe up
+CLEARANCE = 0.02  # added to the ankle's height in the air, for a body of the default size, m
 
 
 def minimum_jerk(share: Array) -> Array:
-    """The step from 0 to 1, over a share of the time from 0 to 1, with the least jerk."""
+    """Minimum-jerk step from 0 to 1, for a fraction of time from 0 to 1."""
     return share**3 * (10.0 + share * (6.0 * share - 15.0))
 
 
 def arm_posture(body: Body, upper: Sequence[ArrayLike], fore: Sequence[ArrayLike]) -> Posture:
-    """Angles of both arms whose parts point in given directions.
+    """Angles of both arms for given directions of upper arms and forearms.
 
     Args:
         body: body with the arms of human32.
         upper, fore: unit vectors of the upper arms and forearms, left and right.
 
     Raises:
-        ValueError: the limits of the joints do not allow the posture.
+        ValueError: the joint limits do not allow the posture.
     """
     angles, error = _solve(body, np.array(upper)[None], np.array(fore)[None])
     if error[0] > REACHED:
@@ -63,13 +63,13 @@ def reaching_posture(
     """Random posture with the wrists inside bounds, reached without self-intersection.
 
     Args:
-        before: previous posture, from which all angles move by minimum jerk; or None.
+        before: previous posture, the start of a minimum-jerk motion of all angles; or None.
         bend: angles of other parts of the body in the posture.
-        bounds: (2, 3) lowest and highest position of the wrists from the shoulders, in lengths of
-            an arm; x outwards.
+        bounds: (2, 3) minimum and maximum of the wrist position relative to the shoulder, in arm
+            lengths; x points outwards.
 
     Raises:
-        ValueError: no posture was found.
+        ValueError: no such posture was found.
     """
     lengths = body.segment_lengths
     upper, fore = lengths['upper_arm'], lengths['forearm']
@@ -116,7 +116,7 @@ def _solve(body: Body, upper: Array, fore: Array) -> tuple[dict[str, Array], Arr
 
 
 def _intersects(body: Body, before: Mapping[str, float], after: Mapping[str, float]) -> bool:
-    """Whether parts of the body run through each other on the way between postures."""
+    """Whether parts of the body intersect in the motion between two postures."""
     share = minimum_jerk(np.linspace(0.0, 1.0, 9))
     poses = np.zeros((len(share), body.dimension))
     for name in after:
@@ -128,12 +128,12 @@ def _intersects(body: Body, before: Mapping[str, float], after: Mapping[str, flo
 
 
 def ahead(heading: Array | float) -> Array:
-    """Unit vectors (..., 2) on the floor in which a person of a heading looks."""
+    """Unit vectors (..., 2) on the floor of the directions in which persons of a heading look."""
     return np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
 
 
 def sole(body: Body) -> float:
-    """Height of the ankle over the floor where the foot is flat, m."""
+    """Height of the ankle above the floor with a flat foot, m."""
     names = body.skeleton.segment_names
     return max(p.radii[1] - p.centre[1] for p in body.flesh.parts if 'foot' in names[p.segment])
 
@@ -160,10 +160,10 @@ def standing_foot(
 def walking_foot(
     body: Body, phase: Array, path: Callable[[Array], tuple[Array, Array]], aside: float
 ) -> tuple[Array, Array]:
-    """Ankle and toe (T, 3) of a foot whose heel strikes where its phase is a whole number.
+    """Ankle and toe (T, 3) of a foot whose heel strikes at integer phases.
 
-    Between the strike and the lift of the heel it stands still; until the toe leaves the floor it
-    turns about the toe.
+    The foot stands still between heel strike and heel lift; then it turns about the toe until that
+    leaves the floor.
 
     Args:
         phase: (T,) increasing phases of the stride.
@@ -183,7 +183,7 @@ def walking_foot(
     forth = np.where(on_toe, foot * (1 - np.cos(pitch)), 0.0)
     up = np.where(on_toe, -foot * np.sin(pitch), 0.0)
 
-    # In the air it goes on from there, at the speed that it has.
+    # In the air the motion continues smoothly, with the same position and velocity.
     air = x >= TOE_OFF
     u = np.clip((x - TOE_OFF) / (1 - TOE_OFF), 0.0, 1.0)
     turning = PUSH * 2 / (TOE_OFF - HEEL_OFF) * (1 - TOE_OFF)
@@ -195,12 +195,12 @@ def walking_foot(
     up = np.where(air, arc, up)
 
     place, heading = path(step + BODY_ABOVE + forth / stride)
-    # On the floor the foot keeps its heading.
+    # The heading of the foot is constant on the floor.
     heading = np.where(air, heading, path(step + BODY_ABOVE)[1])
     return standing_foot(body, place + aside * ahead(heading - np.pi / 2), up, pitch, heading)
 
 
 def cubic(share: Array, start: float, slope: float, end: Array | float) -> Array:
-    """The cubic with a value and a slope at 0, and a value and no slope at 1."""
+    """Cubic polynomial with given value and slope at 0, and given value and zero slope at 1."""
     u, v = share, 1.0 - share
     return (1 + 2 * u) * v * v * start + u * v * v * slope + u * u * (3 - 2 * u) * end

@@ -1,6 +1,6 @@
 """Motions from files: BVH, and ASF/AMC (the mocap skeletons of BME, with 56 and more dimensions).
 
-A motion file knows its own axes and units. `read_motion` turns lengths into metres and angles into
+Motion files differ in axes and units. `read_motion` converts lengths to metres and angles to
 radians and keeps the file's axes for poses; `Motion.joint_positions` gives joints in a world frame
 that is the same for every file: z up, right-handed, metres, origin and heading as recorded. For a
 file with y up, world x, y, z are its x, -z, y.
@@ -33,13 +33,13 @@ WORLD_FROM_FILE = {
     '-x': ((0, 1, 0), (0, 0, -1), (-1, 0, 0)),
 }
 
-# m, cm, mm, inches, and CMU's inches times 0.45; tried before the unit is taken from the stature.
+# m, cm, mm, inches, and CMU's inches / 0.45; tried before the unit is derived from PERSON.
 COMMON_UNITS = (1.0, 0.01, 0.001, 0.0254, 0.0254 / 0.45)
-PERSON = 1.7  # m
+PERSON = 1.7  # stature for a unit that is not common, m
 PERSONS = (1.5, 2.0)  # statures that make a common unit plausible, m
-LIMBS = 0.79  # one leg and one arm, hip to ankle and shoulder to wrist, over the stature
-REACH = 1.4  # a toe to a fingertip, along the bones, over the stature: where names say nothing
-CMU_RATE = 120.0  # frames a second of AMC files, which do not say it
+LIMBS = 0.79  # length of a leg and an arm, hip to ankle and shoulder to wrist, over the stature
+REACH = 1.4  # toe to fingertip along the bones, over the stature; for unknown names
+CMU_RATE = 120.0  # frames per second of AMC files, which do not state it
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +49,9 @@ class Motion:
     Attributes:
         name: name of the file without its suffix.
         body: body with the file's skeleton, without flesh; m and rad. Its joints have standard
-            names (`left_hip`) where those of the file are known, else the names of the file.
+            names (`left_hip`) if those of the file are known, otherwise the names of the file.
         poses: (T, d) poses of that body in the axes of the file, as recorded: they may exceed the
-            limits of an ASF.
+            limits of the ASF.
         fps: frames per second.
         world_from_file: (3, 3) rotation from the file's axes to the world with z up.
         unit_to_m: metres per unit of length of the file.
@@ -118,10 +118,10 @@ def read_motion(
         skeleton: ASF of an AMC; None selects the .asf of the same name beside the file.
         unit_to_m: metres per unit of length. None selects that of the ASF; for a BVH the first of
             metres, centimetres, millimetres, inches and CMU's 5.6444 cm that makes the skeleton a
-            person of 1.5 to 2.0 m, or else the unit that makes it 1.7 m.
-        up_axis: 'x', 'y', 'z', '-x', '-y' or '-z'. None selects the mean axis from the ankles to
-            the head, or y where that is not clear.
-        fps: frames per second. None selects those of a BVH, and 120 for an AMC.
+            person of 1.5 to 2.0 m, otherwise the unit that makes it 1.7 m.
+        up_axis: 'x', 'y', 'z', '-x', '-y' or '-z'. None selects the axis nearest to the mean
+            direction from the ankles to the head, or y if that is not clear.
+        fps: frames per second. None selects the rate in a BVH, and 120 for an AMC.
 
     Raises:
         FileNotFoundError: the file, or the ASF of an AMC, does not exist.
@@ -209,7 +209,7 @@ def _guessed_unit(rig: Rig) -> float:
 
 
 def _longest_way(parents: Sequence[int], spans: Sequence[float]) -> float:
-    """Length of the longest way through the skeleton from one tip to another."""
+    """Length of the longest path through the skeleton from one tip to another."""
     reach = [0.0] * len(spans)
     longest = 0.0
     for joint in range(len(spans) - 1, -1, -1):
@@ -222,7 +222,7 @@ def _longest_way(parents: Sequence[int], spans: Sequence[float]) -> float:
 
 
 def _guessed_up_axis(body: Body, poses: Array) -> str:
-    """The axis that the person stands along; see `read_motion`."""
+    """The vertical axis of a standing person; see `read_motion`."""
     names = ('left_ankle', 'right_ankle', 'head')
     if not set(names) <= set(body.joint_names):
         return 'y'

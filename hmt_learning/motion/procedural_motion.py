@@ -1,8 +1,8 @@
-"""Synthetic motions: a walk, reaching and a dance, for the bodies that ship.
+"""Synthetic motions (walk, reach, dance) for the body models of the package.
 
-A motion is planned in the world of a `Viewpoint`: where the feet stand and step, where the pelvis
-goes above them, and angles of trunk, neck and arms that move smoothly between postures. The legs
-follow by inverse kinematics, so that a foot on the floor stays where it is. All lengths scale with
+A motion is planned in the world frame of a `Viewpoint`: the steps of the feet, the path of the
+pelvis above them, and angles of trunk, neck and arms that move smoothly between postures. Inverse
+kinematics gives the legs, so that a foot on the floor stays where it is. All lengths scale with
 the body.
 """
 
@@ -32,16 +32,16 @@ from hmt_ros.body.limb_angles import SIDES
 from hmt_ros.body.mirror import root_angles, root_rotations
 from hmt_ros.inference.arrays import Array
 
-PLANNING_RATE = 120.0  # Hz at least, at which a motion is planned
-MARGIN = 0.5  # s that are planned before and after, so that smoothing has no ends
-REACHABLE = 0.992  # share of the length of a leg that is used
-ROOM = 4.2  # m that a person may walk straight ahead
-CIRCLE = 1.5  # m, radius of a longer walk
+PLANNING_RATE = 120.0  # minimum rate at which a motion is planned, Hz
+MARGIN = 0.5  # planned before and after, so that smoothing has no boundary effects, s
+REACHABLE = 0.992  # maximum distance from hip to ankle, as a share of the leg length
+ROOM = 4.2  # maximum length of a straight walk, m
+CIRCLE = 1.5  # radius of a longer walk, m
 DEGREE = np.pi / 180
 LEG_DOFS = ('hip_x', 'hip_y', 'hip_z', 'knee', 'ankle_x', 'ankle_y')
 
-# Angles that bend the body in reaching: their bounds, deg, and the bounds of the wrists' positions
-# from the shoulders, outwards, ahead and up, in lengths of the arm. The side of bending is random.
+# Angles that bend the body in reaching. For each kind of reach: their bounds, deg, and bounds of
+# the wrists relative to the shoulders (outwards, ahead, up), in arm lengths. The side is random.
 BENDING = ('root_x', 'root_y', 'trunk_x', 'trunk_y', 'trunk_z', 'neck_x', 'neck_y')
 SIDEWAYS = ('root_y', 'trunk_y', 'trunk_z', 'neck_y')
 REACHES: dict[str, dict[str, Array]] = {
@@ -63,14 +63,14 @@ REACHES: dict[str, dict[str, Array]] = {
     },
 }
 DANCING_WRISTS = np.array([[-0.45, 0.05, -0.85], [0.95, 0.90, 0.95]])
-# Which way the body goes on each beat. The left foot lands on even beats, and a foot that goes its
-# own way never crosses the other.
+# Sideways direction of the body on each beat. The left foot lands on even beats; in this order the
+# feet never cross.
 SIDE_STEPS = np.array([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
 
 
-# A motion before the legs are known, at T times, in the world of a viewpoint, m and rad: where the
-# pelvis would like to be (T, 3) (it goes lower where a leg is too short); angles (T,) by degree of
-# freedom, of which the body may lack some; ankle and toe (T, 3) of the left and of the right foot.
+# A motion without leg angles at T times, in the world frame of a viewpoint, m and rad: desired
+# pelvis positions (T, 3), lowered if a leg is too short; angles (T,) by degree of freedom, ignored
+# if the body lacks it; positions (T, 3) of ankle and toe, of the left foot, then of the right.
 Feet = list[tuple[Array, Array]]
 Plan = tuple[Array, dict[str, Array], Feet]
 Motion = Callable[[Body, Array, float, 'float | None', np.random.Generator], Plan]
@@ -89,7 +89,7 @@ def procedural_motion(
     """Poses (T, d) of a motion, T = duration * fps, in the camera optical frame of a viewpoint.
 
     Args:
-        body: body with flesh and the degrees of freedom of human32; those of a spine move, too.
+        body: body with flesh and the degrees of freedom of human32; a spine moves, too.
         duration: duration, s.
         fps: poses per second. The motion as a function of time does not depend on it.
         heading: direction in which the person looks or walks at first, rad: 0 is towards the
@@ -97,7 +97,7 @@ def procedural_motion(
         viewpoint: place of the camera; the person moves around the origin of its world.
 
     Raises:
-        ValueError: the name is unknown, there is not one pose, or the body does not fit.
+        ValueError: the name is unknown, the duration is below one frame, or the body is unsuitable.
     """
     if name not in PROCEDURAL_MOTIONS:
         raise ValueError(f'no motion {name!r}: wanted one of {sorted(PROCEDURAL_MOTIONS)}')
@@ -134,12 +134,12 @@ def poses_of(
 def walk(
     body: Body, time: Array, duration: float, heading: float | None, rng: np.random.Generator
 ) -> Plan:
-    """Walking: straight ahead as long as that stays in view, else around a circle."""
+    """Plan of a walk: straight ahead if no longer than ROOM, otherwise around a circle."""
     size = (body.segment_lengths['thigh'] + body.segment_lengths['shin']) / 0.825
     step = 0.60 * size * rng.uniform(0.93, 1.07)
     stride_time = 1.12 * np.sqrt(size) * rng.uniform(0.95, 1.05)
     way = 2 * step / stride_time * duration
-    phase = time / stride_time + rng.random()  # the left heel strikes where it is a whole number
+    phase = time / stride_time + rng.random()  # the left heel strikes at integers
     swing = rng.uniform(17, 24) * DEGREE
     turn = rng.choice([-1.0, 1.0]) / CIRCLE if way > ROOM else 0.0
     start = 75 * DEGREE if heading is None else heading
@@ -152,7 +152,7 @@ def walk(
         return ahead(start + turn * gone - np.pi / 2) / turn, start + turn * gone
 
     feet = [
-        # The phase of a foot is that of the body, half a stride later for the right one.
+        # The two feet are half a stride apart.
         walking_foot(
             body,
             phase + 0.5 * side,
@@ -163,7 +163,7 @@ def walk(
     ]
     place, direction = path(phase)
     wave = 2 * np.pi * phase
-    sway = np.sin(wave - 0.4)  # towards the left foot while it stands
+    sway = np.sin(wave - 0.4)  # positive towards the left foot, while that stands
     pelvis = np.full((len(time), 3), np.inf)  # as high as the legs allow
     pelvis[:, :2] = place - (0.018 * size * sway)[:, None] * ahead(direction - np.pi / 2)
     twist = 5 * DEGREE * np.cos(wave)
@@ -181,7 +181,7 @@ def walk(
 def reach(
     body: Body, time: Array, duration: float, heading: float | None, rng: np.random.Generator
 ) -> Plan:
-    """Standing, and reaching with both arms in front, above, aside and low; the trunk bends."""
+    """Plan of a standing person who reaches with both arms in front, above, aside and low."""
     scale, facing = body.scale, 20 * DEGREE if heading is None else heading
     rest = arm_posture(
         body,
@@ -203,7 +203,7 @@ def reach(
         postures += [posture, posture]
     angles = between(time, times, postures)
     angles['root_z'] = np.full(len(time), facing)
-    # As the head goes forwards the pelvis goes back.
+    # The pelvis moves back as the head moves forwards.
     back = -0.22 * scale * np.sin(-angles['root_x'])
     sway = 0.02 * scale * np.sin(2 * np.pi * time / rng.uniform(2.5, 3.5) + rng.uniform(0, 6))
     pelvis = np.full((len(time), 3), np.inf)
@@ -219,15 +219,15 @@ def reach(
 def dance(
     body: Body, time: Array, duration: float, heading: float | None, rng: np.random.Generator
 ) -> Plan:
-    """Turning, stepping aside and bending the knees, with the arms in large movements."""
+    """Plan of a dance: turns, side steps, knee bends and large arm movements."""
     scale, start = body.scale, 0.0 if heading is None else heading
     period = rng.uniform(0.50, 0.60)
-    clock = time / period + 1.5  # in beats; none of the planned times is before beat 0
+    clock = time / period + 1.5  # in beats; all planned times are after beat 0
     bar = len(SIDE_STEPS)
     bars = int(np.ceil((duration + MARGIN) / period + 4)) // bar + 1
     count = bars * bar
 
-    # Every beat has a place and a heading, which the foot that lands on it goes by.
+    # Each beat has a place and a heading for the foot that lands on it.
     def by_bar(low: float, high: float) -> Array:
         return np.repeat(rng.uniform(low, high, bars), bar)
 
@@ -248,7 +248,7 @@ def dance(
         feet.append(standing_foot(body, floor[k], up, pitch, yaws[k] - sign * 10 * DEGREE))
 
     pelvis = np.empty((len(time), 3))
-    lean = 0.13 * np.sin(np.pi * (clock - 0.85))  # towards the foot that stands
+    lean = 0.13 * np.sin(np.pi * (clock - 0.85))  # towards the standing foot
     pelvis[:, :2] = floor.mean(0) + lean[:, None] * (floor[0] - floor[1])
     lengths = body.segment_lengths
     upright = lengths['hip_drop'] + lengths['thigh'] + lengths['shin'] + sole(body)
@@ -280,17 +280,17 @@ PROCEDURAL_MOTIONS: dict[str, Motion] = {'walk': walk, 'reach': reach, 'dance': 
 
 
 def hanging(forwards: float, outwards: float) -> Array:
-    """Direction of an arm that hangs, turned forwards, and to the right, rad."""
+    """Direction (3,) of a hanging arm, swung forwards and to the right by angles in rad."""
     flat = np.cos(outwards)
     return np.array([np.sin(outwards), flat * np.sin(forwards), -flat * np.cos(forwards)])
 
 
 def swinging_arms(body: Body, swing: float, lead: Array) -> dict[str, Array]:
-    """Angles (T,) of arms that swing, each with the leg of the other side.
+    """Angles (T,) of swinging arms, each in phase with the opposite leg.
 
     Args:
-        swing: how far the upper arms swing forwards and back, rad.
-        lead: (T,) from -1, the right leg is in front, to 1, the left one.
+        swing: amplitude of the upper arms, rad.
+        lead: (T,) from -1 (right leg in front) to 1 (left leg in front).
     """
     forth, back = (
         arm_posture(
@@ -314,7 +314,7 @@ def steps(
 
     Args:
         time: (T,).
-        landings: (n,) times, increasing; before the second the foot rests at the first place.
+        landings: (n,) increasing times; the first is of the place where the foot starts.
         air: time in the air before a landing.
         places, headings: (n, 2), (n,) at the landings.
         lift: (n - 1,) heights of the steps.
@@ -326,16 +326,16 @@ def steps(
 
 
 def between(time: Array, times: list[float], postures: list[Posture]) -> dict[str, Array]:
-    """Angles (T,) that go from posture to posture."""
+    """Angles (T,) that move from posture to posture and rest at each."""
     return {name: rests(time, times, [p[name] for p in postures]) for name in postures[0]}
 
 
 def _poses(body: Body, plan: Plan, rate: float, chosen: slice, viewpoint: Viewpoint) -> Array:
-    """Poses (T', d) at some of the times of a plan with so many times per second."""
+    """Poses (T', d) at the chosen times of a plan that has `rate` times per second."""
     skeleton, (pelvis, angles, feet) = body.skeleton, plan
     ankles, toes = (np.stack(x) for x in zip(*feet))
     poses = np.zeros((len(pelvis), body.dimension))
-    # Knees are bent at the start, so that inverse kinematics finds the side to which they bend.
+    # Inverse kinematics starts from bent knees, so that they bend in the right direction.
     bent = {'hip_x': 20 * DEGREE, 'knee': -25 * DEGREE}
     for side in SIDES:
         for joint, angle in bent.items():
@@ -347,7 +347,7 @@ def _poses(body: Body, plan: Plan, rate: float, chosen: slice, viewpoint: Viewpo
     turn = skeleton.dof_index(('root_z', 'root_y', 'root_x'))
     pelvis = _supported(body, pelvis, poses, ankles, max(round(0.035 * rate), 1))
     poses = poses[chosen]
-    # The camera may look up or down.
+    # The camera may be tilted.
     tilt = viewpoint.rotation @ skeleton.mounts[0].T
     poses[:, turn] = np.unwrap(root_angles(body, tilt @ root_rotations(body, poses)), axis=0)
     poses[:, where] = viewpoint.to_camera(pelvis[chosen])
@@ -360,7 +360,7 @@ def _poses(body: Body, plan: Plan, rate: float, chosen: slice, viewpoint: Viewpo
 
 
 def _supported(body: Body, pelvis: Array, poses: Array, ankles: Array, half_width: int) -> Array:
-    """Places (T, 3) of the pelvis from where both legs reach their ankles (2, T, 3)."""
+    """Pelvis positions (T, 3) from which both legs reach their ankles (2, T, 3)."""
     which = body.skeleton.joint_index(('pelvis', 'left_hip', 'right_hip'))
     joints = Viewpoint().to_world(body.joint_positions(poses)[:, which])
     offset = (joints[:, 1:] - joints[:, :1]).transpose(1, 0, 2)
@@ -374,11 +374,11 @@ def _supported(body: Body, pelvis: Array, poses: Array, ankles: Array, half_widt
 
 
 def rests(time: Array, times: ArrayLike, values: ArrayLike) -> Array:
-    """Values (T,) that go from one to the next by minimum jerk and rest at each.
+    """Values (T,) that move from one to the next with minimum jerk and rest at each.
 
     Args:
         time: (T,).
-        times: (n,) of the rests, increasing; before the first and after the last nothing moves.
+        times: (n,) increasing times of the rests; nothing moves before the first or after the last.
         values: (n,) at the rests.
     """
     at, value = np.asarray(times, dtype=np.float64), np.asarray(values, dtype=np.float64)
@@ -392,9 +392,9 @@ def smooth_below(limit: Array, half_width: int) -> Array:
 
     Args:
         limit: (T,).
-        half_width: of each of three moving averages, in samples.
+        half_width: half-width of each of the three moving averages, samples.
     """
-    # The averages together reach three half-widths to each side, and so does the minimum.
+    # The minimum extends three half-widths to each side, as do the three averages together.
     lowest = minimum_filter1d(limit, 6 * half_width + 1, mode='nearest')
     for _ in range(3):
         lowest = uniform_filter1d(lowest, 2 * half_width + 1, mode='nearest')

@@ -1,9 +1,9 @@
 """A recorded motion as poses of another body, in the frame of a camera.
 
-Every motion file has a skeleton of its own. The lengths are measured on the recorded joints; a
-closed-form start follows the limbs outwards (the descending solution of KJS 3); then all frames at
-once are refined on the joint positions within the joint limits. Sweeps that pull every frame
-towards its neighbours determine the twist of a straight limb, which joint positions leave open.
+Every motion file has its own skeleton. The lengths are measured on the recorded joints; initial
+angles follow in closed form along the limbs (the descending solution of KJS 3); then all frames
+are fitted to the joint positions within the joint limits. Joint positions leave the twist of a
+straight limb open; sweeps that pull every frame towards its neighbours determine it.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from hmt_ros.inference import minimise
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import EnergyFunction
 
-# Poses of some frames (n, d), and the frames (n,) -> value, gradient, Hessian.
+# Function of poses (n, d) and their frames (n,) that returns value, gradient and Hessian.
 Misfit = Callable[[Array, Index], tuple[Array, Array, Array]]
 
-# Joints that a motion must have, and the standard deviation of each, m.
+# Joints of a motion that are used, and their standard deviations, m.
 SIGMA = {
     'pelvis': 0.010,
     'neck': 0.005,
@@ -39,16 +39,16 @@ SIGMA = {
     'wrist': 0.005,
     'hand': 0.010,
 }
-OPTIONAL = {'toe': 'ankle', 'hand': 'wrist'}  # and the joint that each hangs on
-SHORTEST = 0.02  # m; a shorter foot or hand of a file has no direction
-FRONT = 0.1  # m before the pelvis: a point that carries the recorded rotation of the pelvis
+OPTIONAL = {'toe': 'ankle', 'hand': 'wrist'}  # may be missing; the joint before each
+SHORTEST = 0.02  # minimum length of a foot or hand for a usable direction, m
+FRONT = 0.1  # distance of the point in front of the pelvis that carries its rotation, m
 FRONT_SIGMA = 0.015
 BELIEF = 4.0  # factor on the standard deviations of the body's soft prior
-NEIGHBOURS = np.radians(4.0)  # deviation of an angle from the mean of the frames beside it
-BRANCH = np.radians(120.0)  # frames beside each other whose angles differ by more do not pull
-APART = np.radians(750.0)  # rad/s; after faster changes a frame starts again from its neighbour
-SWEEPS = 6  # passes in which every frame is drawn towards its neighbours
-SAME = 2.0  # increase of the misfit that is accepted for a continuous motion
+NEIGHBOURS = np.radians(4.0)  # standard deviation of an angle from the mean of the adjacent frames
+BRANCH = np.radians(120.0)  # maximum difference of an angle to an adjacent frame that pulls
+APART = np.radians(750.0)  # rad/s; after faster changes a frame is solved again from its neighbour
+SWEEPS = 6  # number of passes that pull every frame towards its neighbours
+SAME = 2.0  # accepted increase of the misfit for a continuous motion
 
 
 def body_from_motion(motion: Motion, body: Body) -> Body:
@@ -102,9 +102,9 @@ def body_from_motion(motion: Motion, body: Body) -> Body:
 
 
 def hip_drop_share(body: Body) -> float:
-    """Length `hip_drop` over the distance from the pelvis to the middle of the hips."""
+    """Ratio of the length `hip_drop` to the distance from the pelvis to the middle of the hips."""
     if not set(HIPS) <= set(body.joint_names):
-        return 1.0  # a caller that needs more than these joints names what is missing
+        return 1.0  # callers report missing joints themselves
     rest = body.joint_positions(np.zeros((1, body.dimension)))[0]
     pelvis, left, right = rest[body.skeleton.joint_index(HIPS)]
     distance = float(np.linalg.norm(0.5 * (left + right) - pelvis))
@@ -119,17 +119,17 @@ def retarget(
     """Poses of a body that follow a motion, (T, d) in the camera optical frame.
 
     Args:
-        body: body with the limbs of KJS fig. 3, such as those that ship, and the lengths of the
+        body: body with the limbs of KJS fig. 3, such as the bundled ones, and the lengths of the
             person (see `body_from_motion`).
-        camera_from_world: rotation (3, 3) and translation (3,) m that take a point of the motion's
+        camera_from_world: rotation (3, 3) and translation (3,) m that map a point of the motion's
             world (z up) to the camera optical frame (x right, y down, z forward).
 
     Returns:
-        Poses within the limits of the body, continuous in time wherever the limits allow it.
+        Poses within the limits of the body, continuous in time if the limits allow it.
 
     Raises:
-        ValueError: the motion has no standard names, the body has other limbs, the rotation is not
-            one, or the person comes nearer to the camera than the limits of the body allow.
+        ValueError: the motion has no standard names, the body has other limbs, the rotation is
+            invalid, or the person is nearer to the camera than the limits of the body allow.
     """
     rotation, translation = (np.asarray(x, dtype=np.float64) for x in camera_from_world)
     _check_camera(rotation, translation)
@@ -145,7 +145,7 @@ def retarget(
         )
     start = limb_angles(skeleton, place, motion.fps)
     front = place['pelvis'] + FRONT * _recorded_front(motion, rotation, skeleton, start)
-    # The joints, and the point before the pelvis.
+    # The joints, and the point in front of the pelvis.
     joints = skeleton.joint_index(tuple(place))
     sigma = [SIGMA[n.removeprefix('left_').removeprefix('right_')] for n in place]
     segments = np.append(skeleton.joint_segments[joints], 0)
@@ -171,7 +171,7 @@ def _check_camera(rotation: Array, translation: Array) -> None:
 
 
 def _recorded(motion: Motion) -> dict[str, Array]:
-    """Joints of a motion by standard name, (T, 3) in the world, without hands of no length."""
+    """Positions (T, 3) of a motion's joints by name, world frame, without very short hands."""
     central = ['pelvis', 'neck', 'head']
     paired = [f'{s}_{joint}' for s in SIDES for joint in SIGMA if joint not in central]
     names = [n for n in central + paired if n in motion.body.joint_names]
@@ -195,10 +195,10 @@ def _median_norm(x: Array) -> float:
 
 
 def _recorded_front(motion: Motion, rotation: Array, skeleton: Skeleton, start: Array) -> Array:
-    """Unit vectors (T, 3) to the front of the pelvis, as the recorded pelvis turns.
+    """Unit vectors (T, 3) to the front of the pelvis, from its recorded rotation.
 
-    Pelvis and hips alone do not tell how far the pelvis is tilted where a skeleton has them at one
-    height. Its own rotation does, up to a constant direction, found as the mean over the motion.
+    Positions of pelvis and hips do not determine the pelvis's tilt if a skeleton has them at one
+    height. The recorded rotation does, up to a constant direction: the mean over the motion.
     """
     recorded = motion.body.skeleton
     carrier = recorded.joint_segments[recorded.joint_index(('pelvis',))]
@@ -210,7 +210,7 @@ def _recorded_front(motion: Motion, rotation: Array, skeleton: Skeleton, start: 
 
 
 def _refined(body: Body, misfit: Misfit, start: Array, fps: float) -> Array:
-    """The poses (T, d) of least misfit, from a start (T, d)."""
+    """Poses (T, d) of minimum misfit, from initial poses (T, d)."""
     skeleton = body.skeleton
     rotation = skeleton.dof_is_rotation
     step_scale = np.where(rotation, 0.3, 0.1)
@@ -219,7 +219,7 @@ def _refined(body: Body, misfit: Misfit, start: Array, fps: float) -> Array:
     def solve(
         rows: Index, poses: Array, mean: Array, precision: Array, iterations: int
     ) -> tuple[Array, Array]:
-        """Poses (n, d) of some frames with a pull towards means (n, d); and their misfit (n,)."""
+        """Poses (n, d) of some frames, pulled towards means (n, d), and their energies (n,)."""
 
         def objective(x: Array, part: Index) -> tuple[Array, Array, Array]:
             value, gradient, hessian = misfit(x, rows[part])
@@ -245,7 +245,7 @@ def _refined(body: Body, misfit: Misfit, start: Array, fps: float) -> Array:
     mean = np.broadcast_to(body.prior_mean, start.shape)
     poses, value = solve(everyone, start, mean, belief, 40)
 
-    # A frame that came to rest elsewhere than its neighbour follows it, if it fits there as well.
+    # A frame in another minimum than its neighbour moves to the neighbour's, if the fit allows it.
     for step in (1, -1, 1, -1):
         rows = everyone[1:] if step > 0 else everyone[:-1]
         apart = np.abs(poses[rows] - poses[rows - step])[:, rotation].max(1) > APART / fps

@@ -1,7 +1,7 @@
 """The skeleton of a BVH or ASF/AMC file: segments, channels and tips, in file units.
 
 Each segment starts at a joint of the same name, sits at an offset in its parent's frame, and is
-turned by its channels; a tip is a named point at the far end of a segment that carries no other.
+turned by its channels; a tip is a named point at the end of a segment without children.
 `rig_body` turns this into a `Body` with lengths in metres, whose joints have the standard names of
 a human body where the file's names are known.
 
@@ -31,16 +31,16 @@ from msg_tools.files.bounded_file import read_bytes
 
 LARGEST_FILE = 500_000_000  # bytes
 LARGEST_MOTION = 30_000_000  # numbers, frames times channels
-_LARGEST_TEXT, _LINE = 700_000_000, 64  # bytes in memory, and those of a line
+_LARGEST_TEXT, _LINE = 700_000_000, 64  # text in memory, and overhead of a line, bytes
 MOST_SEGMENTS = 2_000
 
-# Where the file sets no limits, those of the root of a human body: ten turns, and a large hall.
+# Limits if the file sets none, as for the root of a human body: ten turns, rad; a large hall, m.
 FREE_ANGLE = 20 * np.pi
 FREE_SHIFT = 1_000.0
-SKULL_AND_HEEL = 0.12  # above the head joint and below the ankle, over the bones between them
-NARROWEST = 1e-6  # a limit of a file may leave no room; a body's must, rad
+SKULL_AND_HEEL = 0.12  # above the head joint and below the ankle, relative to the bones in between
+NARROWEST = 1e-6  # margin added to limits of a file that leave no range, rad
 
-# Names in lower case without separators, sides and prefixes; the first that a file has wins.
+# Names in lower case without separators, sides and prefixes; the first one in the file is used.
 CENTRAL = {
     'pelvis': ('hips', 'hip', 'pelvis', 'root'),
     'neck': ('lowerneck', 'neck', 'necktwist01', 'neck01', 'neck1', 'necklower'),
@@ -56,12 +56,12 @@ PAIRED = {
     'wrist': ('wrist', 'hand'),
     'hand': ('fingerbase', 'hand', 'handend', 'mid1', 'middle1', 'handmiddle1', 'fingers'),
 }
-TIPPED = {'toe': 'ankle', 'hand': 'wrist'}  # else whatever comes next after that joint
+TIPPED = {'toe': 'ankle', 'hand': 'wrist'}  # otherwise any child of that joint
 PREFIX = re.compile(r'^(cc_base_|bip0*1[ _]?|def[-_]|mixamorig\d*[:_]?|character\d+_)', re.I)
 
 
 class MotionFileError(ValueError):
-    """A motion file that can not be read; one line with file, line, what was seen and wanted."""
+    """Unreadable motion file; one line names file, line, what was seen and what was wanted."""
 
     def __init__(self, path: Path, line: int | None, message: str) -> None:
         super().__init__(f'{path}: {message}' if line is None else f'{path}:{line}: {message}')
@@ -69,7 +69,7 @@ class MotionFileError(ValueError):
 
 @dataclass(frozen=True)
 class Channel:
-    """One number a frame: shift along or turn about axis 0 to 2; limits in rad or file units."""
+    """One number per frame: shift along or turn about axis 0 to 2; limits in rad or file units."""
 
     axis: int
     is_rotation: bool
@@ -79,13 +79,13 @@ class Channel:
 
 @dataclass(frozen=True, eq=False)
 class RigJoint:
-    """A named point: the start of a segment, or the tip of one that carries no other.
+    """A named point: the start of a segment, or the tip of a segment without children.
 
     Attributes:
         name: name in the file.
         parent: index of the segment that carries it; -1 for the root.
         offset: (3,) in that segment's frame, file units.
-        length_name: the length that the offset runs along; siblings may share one.
+        length_name: name of the length that scales the offset; siblings may share one.
     """
 
     name: str
@@ -96,7 +96,7 @@ class RigJoint:
 
 @dataclass(frozen=True, eq=False)
 class RigSegment(RigJoint):
-    """A segment of a file's skeleton, and the joint of the same name that it starts at.
+    """A segment of a file's skeleton, and the joint of the same name at its start.
 
     Attributes:
         channels: translations first, then rotations in the order in which they act.
@@ -116,16 +116,16 @@ class Rig:
 
     @property
     def joints(self) -> tuple[RigJoint, ...]:
-        """Starts of the segments, then tips; a joint's parent is also the index of a joint."""
+        """Starts of the segments, then tips; parent indices are valid for joints, too."""
         return (*self.segments, *self.tips)
 
     @property
     def is_rotation(self) -> NDArray[np.bool_]:
-        """(d,) kind of each channel."""
+        """(d,) whether each channel is a rotation."""
         return np.array([c.is_rotation for s in self.segments for c in s.channels], dtype=bool)
 
     def standard_names(self) -> list[str]:
-        """Names of the joints, the standard ones where the skeleton is a human's."""
+        """Names of the joints, standard ones if the skeleton is a human's."""
         return standard_names([x.name for x in self.joints], [x.parent for x in self.joints])
 
 
@@ -142,7 +142,7 @@ def read_text(path: Path) -> str:
         content = read_bytes(path, LARGEST_FILE)
     except ValueError as error:
         raise MotionFileError(path, None, str(error)) from error
-    # All that Python splits lines at.
+    # All characters at which Python splits lines.
     lines = sum(content.count(x) for x in b'\n\r\v\f\x1c\x1d\x1e\x85')
     if 2 * len(content) + _LINE * lines > _LARGEST_TEXT:
         raise MotionFileError(path, None, f'{lines} lines in {len(content)} bytes are too many')
@@ -151,7 +151,7 @@ def read_text(path: Path) -> str:
         raise MotionFileError(path, line, 'binary data, wanted the text of a motion file')
     try:
         return content.decode('utf-8-sig')
-    except UnicodeDecodeError:  # names of joints in some national encoding
+    except UnicodeDecodeError:  # joint names in a national encoding
         return content.decode('latin-1')
 
 
@@ -172,7 +172,7 @@ def numbers(path: Path, line: int, words: Sequence[str], count: int, what: str) 
 
 
 def rig_body(rig: Rig, name: str, unit_to_m: float) -> Body:
-    """Body of a rig without flesh and without beliefs; one length a bone, in metres."""
+    """Body of a rig, without flesh and pose prior; one length per bone, m."""
     names = _unique(rig.standard_names())
     bones = [(x.length_name, x.offset * unit_to_m) for x in rig.joints]
     lengths: dict[str, float] = {}
@@ -226,7 +226,7 @@ def rig_body(rig: Rig, name: str, unit_to_m: float) -> Body:
 
 
 def _rates(rig: Rig, names: Sequence[str]) -> Array:
-    """Variances (d,) per second, as of human37; a segment that it lacks has those of its parent."""
+    """Variances (d,) per second, from human37; segments unknown there take their parent's."""
     person = load_body('human37')
     known = person.skeleton
     turns = {
@@ -260,7 +260,7 @@ def _unique(names: Sequence[str]) -> list[str]:
 
 
 def _upright_bones(rig: Rig, names: Sequence[str]) -> list[str]:
-    """Lengths from left ankle to head by way of the pelvis; none if it is not a human's."""
+    """Names of the lengths from left ankle to head via the pelvis; empty for other rigs."""
     if not {'left_ankle', 'head', 'pelvis'} <= set(names):
         return []
     result = []
@@ -283,7 +283,7 @@ def _limits(channels: Sequence[Channel], unit_to_m: float) -> tuple[Array, Array
 
 
 def _dof_name(rig: Rig, segment: int, channel: Channel) -> str:
-    """As in the models that ship: root_tx, root_z, then LeftLeg_x after the file's own name."""
+    """Name as in the package's models (root_tx, root_z), or from the file's segment (LeftLeg_x)."""
     owner = 'root' if rig.segments[segment].parent < 0 else rig.segments[segment].name
     return f'{owner}_{"" if channel.is_rotation else "t"}{"xyz"[channel.axis]}'
 
@@ -307,14 +307,14 @@ def _chains(rig: Rig, names: Sequence[str]) -> dict[str, tuple[int, ...]]:
 
 
 def standard_names(names: Sequence[str], parents: Sequence[int]) -> list[str]:
-    """The names of a file's joints; standard ones (`left_hip`) where the skeleton is a human's.
+    """Names of a file's joints; standard ones (`left_hip`) if the skeleton is a human's.
 
-    It is one if pelvis, neck, head and all of hips, knees, ankles, shoulders, elbows and wrists are
-    found and lie in that order on the way outwards.
+    A human's skeleton has pelvis, neck, head and all hips, knees, ankles, shoulders, elbows and
+    wrists, each behind the previous joint of its limb.
 
     Args:
         names: (J,) names of the joints in the file.
-        parents: (J,) the joint that each bone comes from, -1 for the root.
+        parents: (J,) index of each joint's parent, -1 for the root.
     """
     found = _matches(names, parents)
     if found is None:
@@ -323,7 +323,7 @@ def standard_names(names: Sequence[str], parents: Sequence[int]) -> list[str]:
     result = []
     for joint, name in enumerate(names):
         own = by_joint.get(joint, name)
-        if joint not in by_joint and own in found:  # a standard name that means another joint
+        if joint not in by_joint and own in found:  # a standard name used for another joint
             own += '_'
         result.append(own)
     return result

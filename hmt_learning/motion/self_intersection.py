@@ -1,4 +1,4 @@
-"""How far the parts of poses overlap, of many poses at once: what a rendered motion must not do."""
+"""Overlap of body parts in many poses at once, which rendered motions must avoid."""
 
 from __future__ import annotations
 

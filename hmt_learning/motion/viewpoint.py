@@ -1,4 +1,4 @@
-"""Where the camera of a made image stands: above a floor, before the person."""
+"""Pose of the camera of a rendered image: above a floor, in front of the person."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hmt_ros.inference.arrays import Array
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A camera over a floor.
+    """A camera above a floor.
 
     Attributes:
         distance: horizontal distance of the camera from the origin of the world, m.

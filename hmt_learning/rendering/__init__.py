@@ -1,1 +1,1 @@
-"""Images of the body model: renderer, clothes and scene, for training sets and made bags."""
+"""Images of the body model: renderer, clothes and scene, for training sets and rendered bags."""

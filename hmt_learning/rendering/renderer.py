@@ -1,16 +1,16 @@
 """Pictures of a body: image, silhouette, part labels and depth of its flesh at given poses.
 
-The spans of pixels of `hmt_ros.body.rasterisation` meet in a depth buffer. Colours are taken at a
+A depth buffer combines the pixel spans of `hmt_ros.body.rasterisation`. Colours are computed on a
 finer raster and averaged.
 
-Depth cameras have noise, steps of disparity and holes. Sensors with structured light or two cameras
+Simulated depth has noise, disparity steps and holes. Sensors with structured light or two cameras
 measure disparity, so that their error grows with the square of the depth [Khoshelham and Elberink,
 Sensors 2012]:
 
     d = 1 / z + noise_d,   noise_d of standard deviation NOISE, smooth over a few pixels
 
-Nothing is measured in the shadow that something near casts between the two eyes of the sensor, at
-edges, where its window sees two depths, on patches that reflect badly, and out of range.
+Depth is missing where a near surface hides a point from one of the sensor's two eyes, at depth
+edges, on patches that reflect badly, and out of range.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from hmt_ros.inference.arrays import Array, Mask
 Picture = NDArray[np.float32]
 
 SUPERSAMPLING = 2
-SHADOW_BLUR = 0.004  # standard deviation of the shadow's edge as a share of the image's width
+SHADOW_BLUR = 0.004  # standard deviation of the blur of the shadow, as a share of the image width
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Rendered:
 
     Attributes:
         image: (H, W, 3) uint8, BGR.
-        mask: (H, W) true where the person is seen.
+        mask: (H, W) true where the person is visible.
         parts: (H, W) int8, index into `body.flesh.parts`; -1 in the background.
         depth: (H, W) float32, z of the surface in the camera frame, m; inf in the background.
     """
@@ -59,7 +59,7 @@ def render(body: Body, pose: ArrayLike, camera: Camera, scene: Scene, frame: int
 
     Args:
         pose: (d,).
-        frame: number of the picture, which seeds its noise.
+        frame: number of the picture, used as a seed of its noise.
 
     Raises:
         ValueError: the body has no flesh, or the pose has a wrong shape.
@@ -77,14 +77,14 @@ def render_frames(body: Body, poses: ArrayLike, camera: Camera, scene: Scene) ->
 def render_people(
     bodies: Sequence[Body], poses: Sequence[ArrayLike], camera: Camera, scene: Scene, frame: int = 0
 ) -> tuple[NDArray[np.uint8], NDArray[np.int8]]:
-    """Picture of several people in a scene; of two the nearer one hides the other as a whole.
+    """Picture of several people in a scene; a nearer person is drawn over those behind.
 
     Args:
-        bodies: with flesh; each person has clothes of its own.
-        poses: (d,) of each.
+        bodies: bodies with flesh; the clothes of each differ.
+        poses: pose (d,) of each.
 
     Returns:
-        (H, W, 3) uint8, BGR, and (H, W) the number of the person who is seen there; -1: nobody.
+        Image (H, W, 3) uint8, BGR, and the index (H, W) of the visible person; -1 if none.
     """
     shape = (camera.height, camera.width)
     image, owners = scene.background(camera).copy(), np.full(shape, -1, dtype=np.int8)
@@ -106,13 +106,13 @@ def render_people(
 
 @dataclass(frozen=True, eq=False)
 class _Renderer:
-    """Common data of pictures of the same body, camera and scene."""
+    """Data shared by all pictures of one body, camera and scene."""
 
     body: Body
     camera: Camera
     scene: Scene
     mesh: Mesh
-    places: Array  # (V, 4) of the vertices, for the clothes
+    places: Array  # (V, 4) texture coordinates of the vertices
     clothes: Clothes
 
     def render(self, pose: ArrayLike, frame: int = 0) -> Rendered:
@@ -135,7 +135,7 @@ class _Renderer:
         return Rendered(scene.add_noise(image, frame), parts >= 0, parts, depth)
 
     def draw(self, image: Picture, triangles: Triangles, frames: Frames) -> None:
-        """The person into the image."""
+        """Draws the person into the image."""
         k = SUPERSAMPLING
         height, width = image.shape[:2]
         left, right = _extent(triangles.u, width)
@@ -162,7 +162,7 @@ class _Renderer:
         window += seen[:, :, :3]
 
     def darken(self, image: Picture, points: Array) -> None:
-        """The shadow of the person's vertices (V, 3, 1) into the image."""
+        """Draws the shadow of the person's vertices (V, 3, 1) into the image."""
         camera, scene = self.camera, self.scene
         fallen = scene.shadow_points(points[:, :, 0])[:, :, None]
         triangles = project(self.mesh, fallen, camera)
@@ -183,7 +183,7 @@ class _Renderer:
 
 @dataclass(frozen=True, eq=False)
 class _Front(Filled):
-    """Each pixel that shows a triangle, with the nearest one."""
+    """Pixels covered by triangles, each with the nearest triangle."""
 
     inverse_depth: Array  # (M,) 1 / z, 1/m
 
@@ -207,8 +207,8 @@ def _planes(triangles: Triangles, values: NDArray[np.floating]) -> tuple[Array, 
 
 
 def _interpolated(triangles: Triangles, values: Picture, front: _Front) -> Picture:
-    """Values (M, k) at the pixels, from values (V, k) at the vertices; right in perspective."""
-    # Divided by the depth they are linear over the image.
+    """Values (M, k) at the pixels, from values (V, k) at the vertices; perspective-correct."""
+    # Values divided by the depth are linear over the image.
     weighted = values[triangles.corners] * triangles.inverse_depth[:, :, None].astype(np.float32)
     which = front.triangles
     base, along_u, along_v = (x.astype(np.float32)[which] for x in _planes(triangles, weighted))
@@ -237,7 +237,7 @@ def _front(triangles: Triangles, filled: Filled, shape: tuple[int, int]) -> _Fro
     np.maximum.at(buffer, filled.pixels, inverse)
     nearest = np.flatnonzero(inverse == buffer[filled.pixels])
     winner = np.full(len(buffer), -1, dtype=np.intp)
-    winner[filled.pixels[nearest]] = nearest  # of equals the last
+    winner[filled.pixels[nearest]] = nearest  # the last one of a tie
     seen = winner[winner >= 0]
     return _Front(
         filled.pixels[seen], filled.rows[seen], filled.columns[seen], which[seen], inverse[seen]
@@ -245,26 +245,26 @@ def _front(triangles: Triangles, filled: Filled, shape: tuple[int, int]) -> _Fro
 
 
 def _extent(places: Array, size: int, margin: int = 0) -> tuple[int, int]:
-    """First pixel and the one after the last that places (px) touch, within an image."""
+    """First pixel that positions (px) cover, and the one after the last, within an image."""
     low, high = np.floor(places.min() + 0.5) - margin, np.floor(places.max() + 0.5) + 1 + margin
     return int(np.clip(low, 0, size)), int(np.clip(high, 0, size))
 
 
 Depth = NDArray[np.floating]
 
-# Standard deviation and step of the disparity, divided by focal length and distance of the eyes:
-# factors on the square of a depth, 1/m.
+# Standard deviation and step of the disparity, divided by focal length and BASELINE: factors on the
+# square of a depth, 1/m.
 NOISE, STEP = 0.0020, 0.0008
-# Standard deviation of the blur that makes neighbouring errors alike, px.
+# Standard deviation of the blur that correlates neighbouring errors, px.
 BLUR = 1.5
-# Distance of the eyes of the sensor, m.
+# Distance between the two eyes of the sensor, m.
 BASELINE = 0.05
-# Depths that differ by more than this share over a pixel are an edge.
+# Relative difference of depth between neighbouring pixels that counts as an edge.
 EDGE = 0.05
 # Share of the pixels that reflect badly, and standard deviation of the patches' blur, px.
 DARK, PATCH = 0.02, 5.0
 NEAREST, FURTHEST = 0.3, 10.0
-# Stream of random numbers of a seed; a scene uses others.
+# Identifier of a random stream; a scene uses others.
 OF_DEPTH = 6
 
 
@@ -272,10 +272,10 @@ def sensed_depth(depth: Depth, camera: Camera, seed: int, frame: int = 0) -> NDA
     """Depths measured by a sensor, from true depths.
 
     Args:
-        depth: (H, W) along the axis of the camera, m; inf where nothing is.
+        depth: (H, W) true depth along the optical axis, m; inf if nothing is there.
 
     Returns:
-        (H, W) mm, 0 where nothing was measured.
+        Depth (H, W), mm; 0 if not measured.
     """
     rng = np.random.default_rng([seed, OF_DEPTH, frame])
     z = np.asarray(depth, dtype=np.float64)
@@ -295,15 +295,15 @@ def sensed_depth(depth: Depth, camera: Camera, seed: int, frame: int = 0) -> NDA
 
 
 def _smooth_noise(rng: np.random.Generator, shape: tuple[int, ...], blur: float) -> Depth:
-    """Noise of unit variance that is alike over some pixels."""
+    """Noise of unit variance, correlated over some pixels."""
     noise = cv2.GaussianBlur(rng.standard_normal(shape), (0, 0), blur)
     return np.asarray(noise / noise.std())
 
 
 def _shadowed(inverse: Depth, shift: float) -> NDArray[np.bool_]:
-    """Pixels hidden from the second eye, to the right, by disparities in units of 1/m."""
+    """Pixels hidden from the sensor's second eye, on the right, from inverse depths, 1/m."""
     column = np.arange(inverse.shape[1])
-    # A pixel is seen there at this column; a nearer surface, further right, covers it.
+    # Column in the second eye's image; a nearer surface from further right covers it.
     there = column - shift * inverse
     nearest_right = np.minimum.accumulate(there[:, ::-1], axis=1)[:, ::-1]
     return there > nearest_right + 0.5

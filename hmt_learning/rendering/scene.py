@@ -1,11 +1,11 @@
-"""Surroundings of a rendered person: light, floor, wall, things, noise; and the clothes.
+"""Surroundings of a rendered person (light, floor, wall, boxes, noise), and clothes.
 
 A scene is a seed and a few numbers. The picture of the empty place follows from them by casting
-rays through every pixel, so that it is right for every distortion of the camera.
+rays through every pixel, so that it is correct under any lens distortion.
 
 Clothes are colours and patterns that are fixed to the surface of the flesh: a shirt with short
 sleeves, shorts, socks, shoes, hair and a face, each with a pattern, so that matching of intensities
-along the surface has something to hold on to.
+along the surface finds texture.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ Real = TypeVar('Real', np.float32, np.float64)
 
 SUPERSAMPLING = 2
 NOISE_LEVELS = 256
-# Streams of random numbers of a seed.
+# Identifiers of the random streams of a seed.
 OF_THINGS, OF_SURFACES, OF_NOISE, OF_CLOTHES = 1, 2, 3, 4
-WAVE_LENGTHS = (0.30, 0.16, 0.10, 0.07)  # m, of the waves that make up a pattern
-# Where cloth ends, as shares of the segment from its start.
+WAVE_LENGTHS = (0.30, 0.16, 0.10, 0.07)  # wavelengths of a pattern, m
+# Boundaries of the cloth, as fractions of the segment from its start.
 SLEEVE, SHORTS, SOCK = 0.80, 0.15, 0.85
-# Cover of the segments whose name contains the word; everything else is skin.
+# Clothing of a segment by a word in its name; other segments show skin.
 KIND_OF_SEGMENT = {
     'head': 'head',
     'neck': 'head',
@@ -59,8 +59,8 @@ class Scene:
         ambient: share of the light that comes from everywhere.
         shadow: share of the other light that a shadow removes, 0 (no shadow) to 1.
         noise: standard deviation of the noise of a pixel, grey levels of 255.
-        clear: least distance of things behind the origin of the world, m.
-        clutter: number of things.
+        clear: minimum distance of the boxes behind the origin of the world, m.
+        clutter: number of boxes.
 
     Raises:
         ValueError: a number is outside its range.
@@ -96,24 +96,24 @@ class Scene:
         return self.viewpoint.rotation @ _unit(np.array(self.light))
 
     def lambert(self, cosine: NDArray[Real]) -> NDArray[Real]:
-        """Light that a surface reflects, by the cosine of its normal to the light; at most 1."""
+        """Reflected share of the light, from the cosine between normal and light; at most 1."""
         lit = self.ambient + (1.0 - self.ambient) * np.maximum(cosine, 0.0)
         return lit.astype(cosine.dtype, copy=False)
 
     def background(self, camera: Camera) -> Picture:
-        """The empty place, BGR (H, W, 3) in grey levels 0 to 255, without noise."""
+        """Image of the empty place, BGR (H, W, 3) in grey levels 0 to 255, without noise."""
         return _empty_place(self, camera)[0]
 
     def depth(self, camera: Camera) -> Array:
-        """Depth (H, W) of the empty place along the axis of the camera, m; inf: nothing."""
+        """Depth (H, W) of the empty place along the optical axis, m; inf where nothing is hit."""
         return _empty_depth(self, camera)
 
     def floor(self, camera: Camera) -> Picture:
-        """Share (H, W) of each pixel that shows the floor and nothing in front of it."""
+        """Fraction (H, W) of each pixel in which the floor is visible."""
         return _empty_place(self, camera)[1]
 
     def shadow_points(self, points: Array) -> Array:
-        """Where the shadows of points (..., 3) fall on the floor; camera frame, m."""
+        """Shadows on the floor (..., 3) of points (..., 3); camera frame, m."""
         world = self.viewpoint.to_world(points)
         light = np.array(self.light)
         return self.viewpoint.to_camera(world - world[..., 2:] / light[2] * light)
@@ -123,7 +123,7 @@ class Scene:
         if self.noise > 0:
             rng = np.random.default_rng([self.seed, OF_NOISE, frame])
             index = rng.integers(0, NOISE_LEVELS, image.shape, dtype=np.uint8)
-            # Rounding: half a grey level more, then towards zero.
+            # Half a grey level more, so that truncation rounds to the nearest level.
             table = np.float32(self.noise) * _normal_quantiles() + np.float32(0.5)
             image = image + cv2.LUT(index, table)
         else:
@@ -143,7 +143,7 @@ def _normal_quantiles() -> Picture:
 
 
 def smooth_noise(points: Array, rng: np.random.Generator) -> Array:
-    """Smooth random values in [-1, 1] at points (N, 2): random at whole numbers, cubic between."""
+    """Smooth random values in [-1, 1] at points (N, 2): random at integers, cubic in between."""
     table = rng.uniform(-1.0, 1.0, (64, 64))
     cell = np.floor(points).astype(np.intp)
     f = points - cell
@@ -157,21 +157,21 @@ def smooth_noise(points: Array, rng: np.random.Generator) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Things:
-    """B boxes that stand on the floor; world of the viewpoint, m."""
+    """B boxes on the floor, in the world frame of the viewpoint, m."""
 
     centre: Array  # (B, 3)
     half: Array  # (B, 3)
     yaw: Array  # (B,)
     colour: Array  # (B, 3)
-    stripes: Array  # (B,) per metre, 0: plain
+    stripes: Array  # (B,) per metre, 0 if plain
 
     def hit(self, origins: Array, rays: Array) -> tuple[Array, NDArray[np.intp], Array, Array]:
-        """First box on each ray (N, 3): distance (inf: none), box, normal, place in the box."""
+        """First box hit by each ray (N, 3): distance (inf if none), index, normal, local point."""
         best = np.full(len(rays), np.inf)
         which = np.zeros(len(rays), dtype=np.intp)
         normal, place = np.zeros((len(rays), 3)), np.zeros((len(rays), 3))
         for b in range(len(self.yaw)):
-            # Only rays that meet the sphere around the box are worth the rest.
+            # Rays that miss the bounding sphere of the box are skipped.
             offset = self.centre[b] - origins
             along = np.einsum('ni,ni->n', offset, rays)
             miss = np.einsum('ni,ni->n', offset, offset) - along * along
@@ -198,7 +198,7 @@ def _things(scene: Scene) -> _Things:
     n = scene.clutter
     half = rng.uniform([0.2, 0.15, 0.25], [0.7, 0.5, 1.1], (n, 3))
     depth = scene.clear + rng.uniform(0.8, 4.0, n)
-    # One thing in every slot across the view, so that some stand behind the person.
+    # One box in each slot across the view, so that some stand behind the person.
     slots = (rng.permutation(n) + rng.uniform(0.1, 0.9, n)) / max(n, 1)
     side = (slots - 0.5) * 1.3 * (scene.viewpoint.distance + depth)
     hsv = rng.uniform([0, 60, 90], [180, 170, 210], (n, 3)).astype(np.uint8)
@@ -226,7 +226,7 @@ def _empty_place(scene: Scene, camera: Camera) -> tuple[Picture, Picture]:
     on_box = t_box < np.minimum(t_wall, t_floor)
     on_floor = (t_floor < t_wall) & ~on_box
 
-    # The wall has stains and a skirting. Rays that meet nothing get its plain colour.
+    # The wall has stains and a skirting. Rays that hit nothing get its plain colour.
     colour = np.tile(base[0] * scene.lambert(light[1:2]), (len(rays), 1))
     on_wall = np.flatnonzero(np.isfinite(t_wall) & ~on_floor & ~on_box)
     at = eye + rays[on_wall] * t_wall[on_wall, None]
@@ -265,7 +265,7 @@ def _empty_place(scene: Scene, camera: Camera) -> tuple[Picture, Picture]:
 
 
 def _wall_and_floor(scene: Scene, eye: Array, rays: Array) -> tuple[Array, Array]:
-    """Distances (N,) at which rays (N, 3) of the world meet the wall and the floor; inf: never."""
+    """Distances (N,) along rays (N, 3) to the wall and to the floor, world frame; inf if missed."""
     wall = -scene.clear - 5.0
     t_wall = np.where(rays[:, 1] < -1e-6, (wall - eye[1]) / np.minimum(rays[:, 1], -1e-6), np.inf)
     t_floor = np.where(rays[:, 2] < -1e-6, -eye[2] / np.minimum(rays[:, 2], -1e-6), np.inf)
@@ -344,11 +344,11 @@ class Clothes:
         )
 
     def places(self, segments: Index, points: Array) -> Array:
-        """Places (V, 4) on the surface, of points (V, 3) given in the frames of segments (V,), m.
+        """Texture coordinates (V, 4) of points (V, 3) in the frames of segments (V,), m.
 
-        A place is how far it lies right, ahead and up of the start of its segment when the person
-        stands at rest, in m of a body of the default size, and the share of the segment, from its
-        start.
+        The first three are the offsets to the right, ahead and up from the start of the segment
+        in the zero pose, scaled to a body of the default size, m. The fourth is the fraction of
+        the segment's length.
         """
         rest = forward(self.body.skeleton, np.zeros((1, self.body.dimension)))
         at = rest.directions(segments, points)[:, :, 0] @ rest.columns[0, :, :, 0].T
@@ -360,7 +360,7 @@ class Clothes:
         return np.concatenate([at / self.body.scale, share], axis=1)
 
     def colours(self, parts: Index, places: Picture) -> Picture:
-        """Colours (M, 3) of places (M, 4) on parts (M,)."""
+        """Colours (M, 3) at texture coordinates (M, 4) of parts (M,)."""
         result = np.empty((len(parts), 3), dtype=np.float32)
         for part, kind in enumerate(self.kinds):
             here = np.flatnonzero(parts == part)
@@ -380,7 +380,7 @@ class Clothes:
             cloth[np.sin(z * (2 * np.pi * self.stripes)) > 0.35] *= 0.55
             if kind == 'sleeve':
                 return _choose(share < SLEEVE, cloth, skin)
-            # A cross on the chest, its four corners on the back.
+            # A cross on the chest; on the back, the four corners around it.
             across, up = np.abs(x), np.abs(z - 0.30)
             bar = (across < 0.035) | (up < 0.030)
             mark = (across < 0.075) & (up < 0.085) & (bar == (y > 0))

@@ -1,1 +1,1 @@
-"""Training sets, and the learning of priors, of motion, and of experts."""
+"""Training sets, and the learning of priors, motion and experts."""

@@ -1,8 +1,8 @@
-"""The calibration of experts on motions that they have not learned from.
+"""Calibration of experts on held-out motions.
 
 Each motion is left out once. The temperature T of the gates and the added covariance E maximise the
-likelihood of the motions left out; the factor s then makes regions as wide as they claim to be
-(`hmt_ros.experts.calibrated_experts`).
+likelihood of the motions left out; then the factor s is chosen so that regions cover their nominal
+probability (`hmt_ros.experts.calibrated_experts`).
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from hmt_ros.inference.arrays import Array, Index
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-LEFT_OUT = 500  # maximum number of samples of a fold that are left out
+LEFT_OUT = 500  # maximum number of held-out samples of a fold
 TEMPERATURES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
 ITERATIONS = 6
-COVERED = 0.9  # probability of the region that should cover that share of the samples left out
-LIGHT = 0.02  # components with less weight than this do not count for a region
+COVERED = 0.9  # nominal probability of the region used for the factor
+LIGHT = 0.02  # minimum relative weight of a component in a region
 LARGEST_FACTOR = 4.0
 
 
 class LearningCalibration(CalibratedExperts):
-    """Calibrated experts that learn; a file has them as `CalibratedExperts`."""
+    """Trainable `CalibratedExperts`; files store them as that class."""
 
     def fit(
         self,
@@ -42,11 +42,11 @@ class LearningCalibration(CalibratedExperts):
         *,
         groups: ArrayLike | None = None,
     ) -> Self:
-        """Learns from inputs (N, p) and targets (N, D).
+        """Fits and calibrates the experts on inputs (N, p) and targets (N, D).
 
         Args:
-            groups: (N,) number of the group of each sample, such as its motion. Neighbouring
-                numbers are left out together. None takes the order of the samples.
+            groups: (N,) index of the group of each sample, such as its motion. Neighbouring
+                groups are left out together. None makes each sample a group.
 
         Raises:
             ValueError: shapes are wrong, values are not finite, or there are too few samples.
@@ -81,17 +81,17 @@ class LearningCalibration(CalibratedExperts):
 
 
 def folds_of(groups: NDArray[Any], folds: int) -> Index:
-    """Fold (N,) of each sample: each fold gets two runs of neighbouring groups."""
+    """Fold (N,) of each sample; each fold has two runs of neighbouring groups."""
     names, which = np.unique(groups, return_inverse=True)
     runs = np.arange(len(names)) * min(2 * folds, len(names)) // len(names)
     return (runs % folds)[which].astype(np.intp)
 
 
 def calibration(left_out: list[tuple[Components, Array]]) -> Calibration:
-    """The calibration with the highest likelihood of samples that were left out.
+    """The calibration that maximises the likelihood of held-out samples.
 
     Args:
-        left_out: Mixtures and targets (n, D) of the samples left out, for each fold.
+        left_out: Predicted mixtures and targets (n, D) of the held-out samples, for each fold.
     """
     candidates = [_added_noise(left_out, temperature) for temperature in TEMPERATURES]
     found = max(candidates, key=lambda one: one[0])[1]
@@ -105,7 +105,7 @@ def calibration(left_out: list[tuple[Components, Array]]) -> Calibration:
 def _added_noise(
     left_out: list[tuple[Components, Array]], temperature: float
 ) -> tuple[float, Calibration]:
-    """The log likelihood, and E by expectation maximisation for a temperature."""
+    """Log likelihood per sample, and E by expectation maximisation at a temperature."""
     size = left_out[0][1].shape[1]
     found = Calibration(temperature, np.zeros((size, size)), 1.0)
     likelihood = -np.inf
@@ -124,12 +124,12 @@ def _added_noise(
         likelihood = total / count
         values, vectors = np.linalg.eigh((scatter - own) / count)
         latest, found = found, replace(found, added=(vectors * np.maximum(values, 0)) @ vectors.T)
-    # The likelihood is that of the state before the last iteration.
+    # The likelihood belongs to the state before the last iteration.
     return likelihood, latest
 
 
 def _squared_distances(found: Components, targets: Array) -> Array:
-    """Squared Mahalanobis distance (n,) of each target to the nearest component that counts."""
+    """Squared Mahalanobis distance (n,) of each target to the nearest component above LIGHT."""
     squares = np.empty_like(found.log_weights)
     for i, noise in enumerate(found.noise):
         offsets = targets - found.means[:, i]

@@ -18,12 +18,12 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.clustering import k_means
 
 FOR_CODEBOOK = 20_000  # maximum number of shape contexts that are clustered
-# Share of each part in the distance between two silhouettes.
+# Weight of each part in the distance between two silhouettes.
 WEIGHTS = {
     'shape_contexts': 1.0, 'edge_pairs': 0.5, 'distances': 1.0, 'moments': 0.5, 'edges': 0.7,
 }  # fmt: skip
-# Components are divided by their standard deviation to this power: 0 keeps the metric of the parts,
-# 1 would make noise as important as everything else.
+# Power of the standard deviation by which components are divided: 0 keeps the metric of the parts,
+# 1 would give noise the same weight as everything else.
 WHITENING = 0.3
 
 
@@ -47,15 +47,15 @@ def learned_descriptor(
     points: int = 100,
     components: int = 96,
 ) -> SilhouetteDescriptor:
-    """The descriptor that silhouettes give.
+    """Learns the descriptor from silhouettes.
 
     Args:
-        parts: of silhouettes with so many points.
+        parts: Parts of silhouettes with `points` points each.
         codebook_size: Number of centres of the codebook.
-        components: Maximum number of components of the vector.
+        components: Maximum number of components of the descriptor.
 
     Raises:
-        ValueError: there are too few silhouettes.
+        ValueError: there are fewer than two silhouettes, or too few for the codebook.
     """
     if len(parts) < 2:
         raise ValueError(f'a descriptor needs 2 silhouettes at least, saw {len(parts)}')
@@ -82,7 +82,7 @@ def learned_descriptor(
 
 
 def _weights(name: str, columns: Array) -> Array:
-    """Weights (k,) of the features (N, k) of a part; moments are weighted one by one."""
+    """Weights (k,) of the features (N, k) of a part; each moment has its own weight."""
     if name == 'moments':
         spread = np.sqrt(columns.shape[1]) * np.maximum(columns.std(0), 1e-6)
     else:

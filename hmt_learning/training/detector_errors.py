@@ -1,4 +1,4 @@
-"""How the keypoints of a detector err, in windows of images.
+"""Simulated errors of detected keypoints in windows of images.
 
 Errors of single landmarks are in `image/keypoint_schemes.yaml`.
 """
@@ -16,35 +16,35 @@ from hmt_ros.inference.arrays import Array
 
 Floats = NDArray[np.float32]
 
-# Landmarks of parts of the body.
+# Masks of landmarks.
 BELOW_KNEE = np.array([name.endswith(('knee', 'ankle', 'heel', 'toe')) for name in LANDMARKS])
 BELOW_HIP = BELOW_KNEE | np.array([name.endswith('hip') for name in LANDMARKS])
 
 
 @dataclass(frozen=True)
 class DetectorErrors:
-    """How the keypoints of a detector err together.
+    """Parameters of the joint errors of a detector's keypoints.
 
-    `sigma`, how much of the variance lasts and how often sides are exchanged are near what
-    `benchmarks keypoint_noise` measures on rendered clips; the rest is chosen.
+    `sigma`, `lasting` and `exchanged` are close to the values that `benchmarks keypoint_noise`
+    measures on rendered clips; the others are chosen by hand.
 
     Attributes:
-        sigma: Standard deviation of a keypoint that is sure, m at the person.
-        spread: Standard deviation of its logarithm over persons.
-        white, lasting, constant: Shares of the variance of errors that differ from image to image,
-            that last for `time`, and that stay.
-        time: Time for which the second kind lasts, s.
-        hidden, always_hidden: Shares of the landmarks that are unsure for a while, and always.
-        hidden_time: Half of that while, s.
-        hidden_factor: Largest factor on the errors of an unsure landmark.
-        heavy: Share of the landmarks that err as much although they seem sure.
-        unconfident: Share of detectors that have no confidences.
+        sigma: Standard deviation of a confident keypoint, m at the person.
+        spread: Standard deviation of log `sigma` over windows.
+        white, lasting, constant: Shares of the error variance that are independent between images,
+            correlated over `time`, and constant.
+        time: Correlation time of the `lasting` errors, s.
+        hidden, always_hidden: Shares of landmarks that are uncertain for some time, and always.
+        hidden_time: Mean half-duration of the uncertainty, s.
+        hidden_factor: Maximum factor on the errors of an uncertain landmark.
+        heavy: Share of landmarks with large errors in spite of a high confidence.
+        unconfident: Share of detectors without confidences.
         missing: Share of landmarks, of single keypoints and of images that are missing.
-        cut: Shares of windows without what is below the knees, and below the hips.
-        beyond: Factor on the errors of a landmark beyond the border, by the tangent of the angle.
-        doubted: Loss of confidence there, by the same; half of the detectors leave it out.
-        exchanged: Shares of windows where nothing, all, arms, legs are called by the other side.
-        exchange_time: Half of the time for which they are, s; half of them stay.
+        cut: Shares of windows without landmarks from the knees down, and from the hips down.
+        beyond: Increase of the error of a landmark beyond the border, per tangent of the angle.
+        doubted: Decrease of its confidence, per tangent; half of the detectors omit it.
+        exchanged: Shares of windows in which nothing, all, arms or legs have swapped sides.
+        exchange_time: Mean half-duration of a swap, s; half of the swaps last the whole window.
     """
 
     sigma: float = 0.016
@@ -76,15 +76,15 @@ def with_errors(
     amount: float = 1.0,
     border: Array | None = None,
 ) -> tuple[Floats, Floats]:
-    """Rays (N, S, L, 2) and confidences (N, S, L) as a detector would see them.
+    """Rays (N, S, L, 2) and confidences (N, S, L) with the errors of a detector.
 
     Args:
-        rays, confidences: as they are; confidence 0: the scheme lacks a landmark, or there is no
-            image.
-        distance: (N,) of the person, m.
-        times: (N, S) of the images, s; the same order in all windows.
-        amount: factor on the deviations.
-        border: (N,) the lowest y / z in the images; None: they show everything.
+        rays, confidences: exact values; a confidence of 0 marks a landmark missing in the scheme,
+            or a missing image.
+        distance: (N,) distance of the person, m.
+        times: (N, S) times of the images, s; in the same order in all windows.
+        amount: factor on the standard deviations.
+        border: (N,) y / z of the lower image border; None if nothing is cut off.
     """
     e = DetectorErrors()
     n, s, count = confidences.shape
@@ -103,7 +103,7 @@ def with_errors(
         lasting[:, after] *= np.sqrt(1 - rho * rho)
         lasting[:, after] += rho * lasting[:, before]
     noise += np.sqrt(f32(e.lasting)) * lasting
-    # Landmarks that are hidden, for a while or all the time, and those that err without saying so.
+    # Landmarks hidden for some time or always, and those with large errors at high confidence.
     reach = float(TIMES.max()) + 0.1
     middle, half = (
         rng.uniform(-reach, reach, (n, 1, count)),
@@ -139,7 +139,7 @@ def with_errors(
 def _exchange(
     rays: Floats, confidences: Floats, times: Array, rng: np.random.Generator, e: DetectorErrors
 ) -> None:
-    """Exchanges left and right in some windows: for a run of images, or for all of them."""
+    """Swaps left and right in some windows, for a run of images or for all of them."""
     n = len(rays)
     kind = rng.choice(4, n, p=e.exchanged)
     whole, reach = rng.random(n) < 0.5, float(TIMES.max()) + 0.2

@@ -1,13 +1,14 @@
-"""Tracks of landmarks of people who move, and people put together from several of them.
+"""Landmark trajectories of moving people, and people assembled from several of them.
 
-Recorded motions become tracks: of the person who was recorded, mirrored, of other proportions, with
-angles that wander, and of people who sit.
+Each recorded motion gives several tracks: as recorded, mirrored, with other proportions, and with
+wandering angles. Tracks of seated people are synthetic.
 
     p_legs = r + R l        p_trunk = r + R t        p_arm = r + R (s + C a)
 
-r, R are place and turn of the pelvis; l, t, s places of legs, trunk and shoulder in its frame; C is
-the turn of the chest in that frame, a the place of an arm from its shoulder in the chest's frame.
-Legs with r and R, trunk with s and C, and arms may be of three tracks.
+r, R are position and rotation of the pelvis; l, t, s positions of legs, trunk and shoulder in its
+frame; C is the rotation of the chest in that frame, a the position of an arm relative to its
+shoulder in the chest's frame. Legs with r and R, trunk with s and C, and arms may come from three
+different tracks.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from hmt_ros.inference.arrays import Array, Index
 
 Floats = NDArray[np.float32]
 
-# Joints of the poses that are learned.
+# Joints of the poses to be learned.
 JOINTS = (
     'neck',
     'head',
@@ -50,38 +51,38 @@ JOINTS = (
     ),
     'pelvis',
 )
-# Landmarks of schemes of joint centres, which a track has behind those on the skin.
+# Joint centres, for keypoint schemes that use them; a track has them after the skin landmarks.
 CENTRES = tuple(name for name in INSTEAD if name != 'centre_of_neck')
 SHOULDERS = ('left_shoulder', 'right_shoulder')
-# Lengths that go with the legs, and with the arms.
+# Lengths taken from the track of the legs, and from that of the arms.
 OF_PELVIS = ('thigh', 'shin', 'foot', 'hip_width', 'hip_drop')
 OF_ARM = ('upper_arm', 'forearm', 'hand')
 
-# Tracks of each motion; from the third on angles wander.
+# Number of tracks per motion, and how many of them have no wandering angles.
 VARIANTS, PLAIN = 4, 2
-# Segments of the pelvis and of the chest.
+# Indices of the segments of pelvis and chest.
 PELVIS, CHEST = 0, 1
-# Tracks of people who sit, and their frames; mean and deviation of the angles of hips, knees and of
-# the lean of the pelvis; deviation of other angles of the legs, degrees.
+# Number of seated tracks and of their frames; mean and standard deviation of the angles of hips and
+# knees; standard deviations of the pelvis's lean and of other leg angles, degrees.
 SEATED, SEATED_FRAMES = 48, 240
 SEATED_HIP, SEATED_KNEE, SEATED_LEAN, SEATED_OTHER = (85.0, 12.0), (-88.0, 22.0), 9.0, 8.0
-# Distance from the axis of the trunk, or of a leg, within which a joint of an arm meets it, m.
+# Radius of trunk and leg, within which a joint of an arm counts as inside, m.
 TRUNK_RADIUS, LEG_RADIUS = 0.10, 0.07
-# Least deviation of the places of landmarks over people, clothes and detectors, m.
+# Minimum standard deviation of a landmark over people, clothes and detectors, m.
 LEAST_SIGMA = 0.022
-# Share of the spread of lengths over people by which a variant differs; a length keeps this share.
+# Factor on the spread of lengths over people, for variants; minimum share of a length that remains.
 OF_SPREAD, SHORTEST_LENGTH = 0.8, 0.4
-# Angles that wander: standard deviations of joints, and of the lean of root and trunk; time, s.
+# Wandering angles: standard deviations of joints, and of root and trunk; correlation time, s.
 WANDER, LEAN, WANDERING = np.radians(7.0), np.radians(4.0), 2.0
-SHORTEST = 10  # frames of a motion
+SHORTEST = 10  # minimum number of frames of a motion
 
 
 @dataclass(frozen=True, eq=False)
 class Figures:
-    """Points of people, F frames, in the frames of their parts, m.
+    """Points of people in F frames, in the coordinates of their body parts, m.
 
     Attributes:
-        points: (F, P, 3) of legs and trunk in the frame of the pelvis; of arms from the shoulder,
+        points: (F, P, 3) legs and trunk in the frame of the pelvis; arms relative to the shoulder,
             in the frame of the chest.
         shoulders: (F, 2, 3) left and right, in the frame of the pelvis.
     """
@@ -92,18 +93,17 @@ class Figures:
 
 @dataclass(frozen=True, eq=False)
 class KeypointTracks:
-    """Tracks of landmarks, F frames in all, RATE a second.
+    """Tracks of landmarks, F frames in total, RATE per second.
 
     Attributes:
-        landmarks: and centres of joints that schemes may have instead.
-        joints: of a person of the usual lengths.
-        pelvis, chest: (F, 3, 3) turns of the pelvis, and of the chest in the pelvis's frame.
-        roots: (F, 3) of the person, m.
+        landmarks: landmarks of the tracked persons, then the joint centres of some schemes.
+        joints: joints of a person of the usual lengths in the same poses.
+        pelvis, chest: (F, 3, 3) rotations of the pelvis, and of the chest in the pelvis's frame.
+        roots: (F, 3) root positions relative to their mean over the track, m.
         starts, counts: (M,) first frame and number of frames of each track.
-        lengths: (M, P) logarithms of the lengths (`lifter.PROPORTIONED`) over the usual ones.
-        weights: (M,) share of the windows that are drawn from a track; they sum to 1. Of one that
-            is seated 0.
-        seated: (M,) whether a track is of legs that sit, with a trunk that is of no use.
+        lengths: (M, P) log ratios of the lengths (`lifter.PROPORTIONED`) to the usual ones.
+        weights: (M,) share of the windows that are drawn from each track; 0 for seated tracks.
+        seated: (M,) whether a track is of a seated person; only its legs are used.
         usual: body with the usual lengths.
     """
 
@@ -132,8 +132,8 @@ def keypoint_tracks(
     """Tracks of motions, with variants.
 
     Args:
-        body: with the usual lengths.
-        shares: of each motion among the windows, beside the square root of its length.
+        body: body with the usual lengths.
+        shares: factor on each motion's share of the windows, the square root of its length.
         variants: number of tracks of each motion; the first is the motion itself.
         seated: number of tracks of people who sit.
 
@@ -191,7 +191,7 @@ def keypoint_tracks(
 def _parts(
     body: Body, person: Body, poses: Array, rng: np.random.Generator | None
 ) -> tuple[Figures, Figures, Array, Array, Array]:
-    """Landmarks of a person and joints of the usual body in parts, turns and roots of T poses."""
+    """Landmarks of a person, joints of the usual body, rotations and roots of T poses."""
     which = body.skeleton.joint_index(JOINTS)
     frames = forward(person.skeleton, poses)
     turns = frames.rotations()
@@ -207,7 +207,7 @@ def _parts(
 def _figure(
     names: Sequence[str], places: Array, body: Body, poses: Array, pelvis: Array, chest: Array
 ) -> Figures:
-    """Points (T, P, 3) of poses in the frames of their parts."""
+    """Points (T, P, 3) of poses in the coordinates of their body parts."""
     shoulders = body.joint_positions(poses)[:, body.skeleton.joint_index(SHOULDERS)]
     points = (places - poses[:, None, :3]) @ pelvis
     shoulders = (shoulders - poses[:, None, :3]) @ pelvis
@@ -217,7 +217,7 @@ def _figure(
 
 
 def _arms_of(names: Sequence[str]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which points are of the left and of the right arm, below the shoulder."""
+    """Masks of the points of the left and of the right arm, without the shoulder."""
     below = ('elbow', 'wrist', 'hand')
     left, right = (
         np.array([x.startswith(side) and x.endswith(below) for x in names])
@@ -227,7 +227,7 @@ def _arms_of(names: Sequence[str]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]
 
 
 def _legs_of(names: Sequence[str]) -> NDArray[np.bool_]:
-    """Which points go with the pelvis."""
+    """Mask of the points of legs and pelvis."""
     lower = ('hip', 'knee', 'ankle', 'heel', 'toe', 'pelvis')
     return np.array([x.endswith(lower) for x in names])
 
@@ -235,7 +235,7 @@ def _legs_of(names: Sequence[str]) -> NDArray[np.bool_]:
 def _other_lengths(
     body: Body, lengths: dict[str, float], rng: np.random.Generator
 ) -> dict[str, float]:
-    """Lengths of a person of another size and other proportions, as the body says people have."""
+    """Lengths of a person of other proportions, drawn with the body's length covariance."""
     names = body.skeleton.length_names
     factor = np.linalg.cholesky(body.length_covariance + 1e-12 * np.eye(len(names)))
     other = OF_SPREAD * factor @ rng.normal(size=len(names))
@@ -246,7 +246,7 @@ def _other_lengths(
 
 
 def _varied(body: Body, poses: Array, rng: np.random.Generator) -> Array:
-    """Poses whose angles wander."""
+    """Poses with slowly varying noise on the angles."""
     size = np.where(body.skeleton.dof_is_rotation, WANDER, 0.0)
     size[3] = 0.0
     size[4:AXES] = LEAN
@@ -256,7 +256,7 @@ def _varied(body: Body, poses: Array, rng: np.random.Generator) -> Array:
 
 
 def _wandering(shape: tuple[int, ...], size: Array, rng: np.random.Generator) -> Array:
-    """Angles (T, d) that wander about 0 with standard deviations (d,)."""
+    """Autoregressive noise (T, d) of mean 0 with standard deviations (d,)."""
     keep = np.exp(-1.0 / (WANDERING * RATE))
     drawn = np.sqrt(1.0 - keep**2) * rng.normal(size=shape)
     drawn[0] /= np.sqrt(1.0 - keep**2)
@@ -282,7 +282,7 @@ def _seated(body: Body, rng: np.random.Generator) -> Array:
 
 
 def _places(body: Body, poses: Array, rng: np.random.Generator | None) -> Array:
-    """Landmarks and centres (T, L + C, 3) of a person; rng: their places vary by person."""
+    """Landmarks and centres (T, L + C, 3) of a person; rng, if given, draws their offsets."""
     names = (*LANDMARKS, *CENTRES)
     joints, offsets = landmark_offsets(body, names)
     if rng is not None:
@@ -303,10 +303,10 @@ def assembled(
     rows: Index,
     part: Floats | None = None,
 ) -> Floats:
-    """Places (N, S, P, 3) of points from rows (3, N, S) of legs, trunk and arms.
+    """Point positions (N, S, P, 3) from frames (3, N, S) of legs, trunk and arms.
 
     Args:
-        part: (3, N, S) share of the frame after each row; None: 0.
+        part: (3, N, S) interpolation weight of the next frame; None stands for 0.
     """
 
     def at(values: Floats, of: int) -> Any:
@@ -327,7 +327,7 @@ def assembled(
 
 
 def meet(joints: Floats) -> NDArray[np.bool_]:
-    """Whether arms are within the trunk or a leg, of joints (N, J, 3)."""
+    """Whether an arm is inside the trunk or a leg, for joints (N, J, 3)."""
 
     def place(name: str) -> Floats:
         return joints[:, JOINTS.index(name)]

@@ -1,9 +1,9 @@
-"""Windows of keypoints to learn from: motions seen by random cameras and a detector that errs.
+"""Training windows of keypoints: motions seen by random cameras and an imperfect detector.
 
-A window is drawn from a track (`keypoint_tracks`), with the trunk and arms of other tracks in some
-windows: its camera (heading, height, pitch, roll, distance, maybe moving, whether its border cuts
-the person), the rate of its images, the speed of the motion, the scheme of the detector and its
-errors (`detector_errors`), the knowledge of gravity and of the person's lengths.
+A window is drawn from a track (`keypoint_tracks`), sometimes with trunk and arms of other tracks.
+Random are its camera (heading, elevation, roll, distance, motion, a border that cuts the person),
+image rate, speed of the motion, keypoint scheme, detector errors (`detector_errors`), and whether
+gravity and the person's lengths are known.
 """
 
 from __future__ import annotations
@@ -29,35 +29,36 @@ from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.lifted_poses import HIPS
 from hmt_ros.inference.arrays import Array, Index
 
-# Landmarks that centres of joints replace.
+# Indices of the landmarks that joint centres replace.
 REPLACED = tuple(LANDMARKS.index(INSTEAD[name]) for name in CENTRES)
 
 
 @dataclass(frozen=True)
 class WindowSettings:
-    """The distribution that windows are drawn from.
+    """Distribution of the random windows.
 
     Attributes:
-        elevation, elevation_spread: angle by which the camera looks down, degrees.
-        roll_spread: of the camera, degrees.
-        unusual: share of cameras from far above or below, that roll.
-        distances, near_distances: of the person, m; of one who is near.
-        near: share of windows in which the person is near and the lower border cuts.
-        borders: the lower border of such an image, tangent of the angle below the axis.
+        elevation, elevation_spread: mean and standard deviation of the angle by which the camera
+            looks down, degrees.
+        roll_spread: standard deviation of the camera's roll, degrees.
+        unusual: share of cameras with extreme elevation and five times the roll.
+        distances, near_distances: range of the person's distance, and for a near person, m.
+        near: share of windows in which the person is near and cut by the lower border.
+        borders: range of the lower border of such an image, tangent of the angle below the axis.
         recombined: share of windows with the trunk and the arms of another motion; in half of them
             the arms are of a third one.
-        asynchronous: share of windows whose legs, trunk and arms are at different times, of one
-            motion as well.
-        seated: share of windows of people who sit.
-        moving, speed: share of cameras that move, and their speed, m/s.
-        rates: images a second, drawn evenly on a logarithmic scale.
-        usual_rate: share of windows of 30 images a second.
-        speeds: factor on the speed of the motion.
-        noise: factor on the errors of the detector; 0: it does not err.
-        gravity, gravity_spread: share of windows where it is known, and its error, degrees.
-        lengths, lengths_spread: share of windows where the lengths are known, and their error.
+        asynchronous: share of windows in which legs, trunk and arms are at different times, even
+            of one motion.
+        seated: share of windows of seated people.
+        moving, speed: share of moving cameras, and standard deviation of their velocity, m/s.
+        rates: range of images per second, log-uniform.
+        usual_rate: share of windows with RATE images per second.
+        speeds: range of the factor on the speed of the motion.
+        noise: factor on the errors of the detector; 0 disables them.
+        gravity, gravity_spread: share of windows with known gravity, and its error, degrees.
+        lengths, lengths_spread: share of windows with known lengths, and their relative error.
         causal: share of windows without later images.
-        cut: share of windows whose past or future is short, as where a track starts.
+        cut: share of windows with a short past or future, as at the start of a track.
     """
 
     elevation: float = 8.0
@@ -95,10 +96,10 @@ def training_windows(
     """Random windows and the poses in them.
 
     Args:
-        scheme: row of `SCHEMES`; None: all of them.
+        scheme: row of `SCHEMES` for all windows; None draws it for each.
 
     Returns:
-        Inputs (N, p), and joints (N, J, 3) along the axes of a camera that looks at the person.
+        Inputs (N, p), and joints (N, J, 3) in the axes of a camera turned towards the person.
     """
     s = settings or WindowSettings()
     n, f32 = count, np.float32
@@ -107,7 +108,7 @@ def training_windows(
     times, there, rows, part = _images(now, tracks.counts[which], rng, s)
     base, first = tracks.starts[which][:, :, None] + rows, tracks.starts[which] + now
     joints = assembled(tracks, tracks.joints, JOINTS, first[..., None])[:, 0]
-    # Parts that meet stay those of one motion; hands of people who sit are in their laps.
+    # Intersecting parts are replaced by those of one motion; seated people may have hands on laps.
     met = meet(joints) & ~tracks.seated[which[0]]
     for one in (base, first, which, part):
         one[1:, met] = one[:1, met]
@@ -129,7 +130,7 @@ def training_windows(
     near, border = rng.random(n) < s.near, np.full(n, np.inf)
     border[near] = rng.uniform(*s.borders, near.sum())
     distance[near] = rng.uniform(*s.near_distances, near.sum())
-    # The pelvis is about the border.
+    # The pelvis is near the border.
     across[near, 1] = border[near] + rng.uniform(-0.35, 0.25, near.sum())
     ahead = np.concatenate([across, np.ones((n, 1))], axis=1).astype(f32)
     moves = s.speed * rng.normal(size=(n, 3)) * (rng.random(n) < s.moving)[:, None]
@@ -168,7 +169,7 @@ def _drawn_tracks(
 
 
 def _drawn_shares(which: Index, rng: np.random.Generator, s: WindowSettings) -> Array:
-    """How far tracks (3, N) are over."""
+    """Current times in tracks (3, N), as fractions of their durations."""
     result: Array = rng.random(which.shape)
     together = rng.random(which.shape[1]) >= s.asynchronous
     for part in (1, 2):
@@ -177,7 +178,7 @@ def _drawn_shares(which: Index, rng: np.random.Generator, s: WindowSettings) -> 
     return result
 
 
-# Landmarks (rows) that schemes have, how often each is drawn, and which are of joint centres.
+# Landmarks that schemes (rows) have, their frequencies, and whether they use joint centres.
 _ON_SKIN = ('mediapipe33', 'coco17', 'body25', 'skeleton2d')
 
 
@@ -194,14 +195,14 @@ OF_CENTRES = np.array([False] * len(_ON_SKIN) + [True])
 def _images(
     now: Index, counts: Index, rng: np.random.Generator, s: WindowSettings
 ) -> tuple[Array, NDArray[np.bool_], Index, Floats]:
-    """Times of images (N, S), whether there are any, rows of frames, share of the next frame.
+    """Times of images (N, S), their existence, frame indices, and interpolation weights.
 
     Args:
-        now, counts: (3, N) frames now, and numbers of frames, of the tracks of the parts; the
-            images end where the first track does, others are played on from their ends.
+        now, counts: (3, N) current frames and numbers of frames of the tracks of the parts. Images
+            end with the first track; shorter tracks of other parts are reflected in time.
 
     Returns:
-        Times and whether (N, S), rows and shares (3, N, S).
+        Times and existence (N, S); rows and weights of the next row (3, N, S).
     """
     n = now.shape[1]
     rate = np.exp(rng.uniform(np.log(s.rates[0]), np.log(s.rates[1]), n))
@@ -222,7 +223,7 @@ def _images(
 
 
 def _cameras(n: int, rng: np.random.Generator, s: WindowSettings) -> Floats:
-    """Rotations (N, 3, 3) of the person in front of the camera."""
+    """Random rotations (N, 3, 3) of the person relative to the camera."""
     down = np.clip(s.elevation + s.elevation_spread * rng.normal(size=n), -35.0, 60.0)
     roll = s.roll_spread * rng.normal(size=n)
     far = rng.random(n) < s.unusual

@@ -1,4 +1,4 @@
-"""Learning of how the lengths of a body vary over people, from skeletons.
+"""Learning of the variation of body lengths over people, from skeletons.
 
 Lengths vary by a common stature and by proportions:
 
@@ -6,10 +6,10 @@ Lengths vary by a common stature and by proportions:
     t^2  <- (m t0^2 + sum_n E[s_n^2]) / (m + N - 1)
     p_i^2 <- (m p0_i^2 + sum_n E[(x_ni - s_n)^2]) / (m + N - 1)
 
-EM for one factor with equal loadings; t0 and p0 are the usual spreads, which count as m people. An
-additive length (`shoulder_rise`, which may be negative) has its difference from the mean over the
-length of the model in place of the logarithm. Means are not learned: skeletons place trunk, neck
-and hips each in a way of their own.
+This is EM for one factor with equal loadings; t0 and p0 are the usual spreads, with the weight of m
+people. For an additive length (`shoulder_rise`, which may be negative) the ratio to the model's
+length replaces the logarithm. Means are not learned, because skeletons differ in the definition of
+trunk, neck and hips.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ import numpy as np
 from hmt_ros.body import Body
 from hmt_ros.inference.arrays import Array
 
-# Number of people that the spreads of the body model count as.
+# Weight m of the body model's spreads, in people.
 USUAL_PEOPLE = 10.0
 ADDITIVE = ('shoulder_rise',)
-# Lengths that do not change with the pose in any skeleton, and how alike they are in copies of one.
+# Lengths that are constant in any skeleton; their maximum log difference in copies of a skeleton.
 RIGID, ALIKE = ('thigh', 'shin', 'upper_arm', 'forearm'), 0.02
 ITERATIONS = 500
 
 
 @dataclass(frozen=True, eq=False)
 class LengthSpread:
-    """How lengths vary over people.
+    """Variation of lengths over people.
 
     Attributes:
         stature: relative standard deviation of the stature.
@@ -44,16 +44,16 @@ class LengthSpread:
 
     @property
     def covariance(self) -> Array:
-        """(L, L) of relative lengths."""
+        """Covariance (L, L) of relative lengths."""
         count = len(self.proportions)
         return np.asarray(np.diag(self.proportions**2) + np.full((count, count), self.stature**2))
 
 
 def usual_spread(body: Body) -> LengthSpread:
-    """The spread in the file of a body model.
+    """The spread in a body model's file.
 
     Raises:
-        ValueError: a body whose lengths have no common stature and proportions.
+        ValueError: the length covariance is not that of a stature and proportions.
     """
     lengths = body.skeleton.lengths
     relative = body.length_covariance / np.outer(lengths, lengths)
@@ -65,10 +65,10 @@ def usual_spread(body: Body) -> LengthSpread:
 
 
 def relative_lengths(body: Body, lengths: Array) -> Array:
-    """Lengths (N, L) in m as logarithms, the additive ones over the model's.
+    """Logarithms of lengths (N, L) in m; additive ones are divided by the model's.
 
     Raises:
-        ValueError: a length that is not positive.
+        ValueError: a length is not positive.
     """
     names = body.skeleton.length_names
     additive = np.array([name in ADDITIVE for name in names])
@@ -86,13 +86,13 @@ def relative_lengths(body: Body, lengths: Array) -> Array:
 def own_skeletons(
     body: Body, people: Sequence[str], lengths: Array
 ) -> tuple[tuple[str, ...], Array]:
-    """The people with a skeleton of their own, each once, and its relative lengths (n, L).
+    """People with their own skeleton, each once, and its relative lengths (n, L).
 
-    Motions are often put on a skeleton that many share; nothing is learned from such a skeleton.
+    Motions are often retargeted to a shared skeleton; nothing is learned from such skeletons.
 
     Args:
-        people: (N,) whose skeleton each is.
-        lengths: (N, L) m.
+        people: (N,) person of each skeleton.
+        lengths: (N, L) lengths of each skeleton, m.
     """
     relative = relative_lengths(body, lengths)
     rigid = relative[:, [body.skeleton.length_names.index(name) for name in RIGID]]
@@ -109,12 +109,12 @@ def own_skeletons(
 def learned_spread(
     relative: Array, usual: LengthSpread, usual_people: float = USUAL_PEOPLE
 ) -> LengthSpread:
-    """The most probable spread.
+    """Maximum a posteriori estimate of the spread.
 
     Args:
         relative: (N, L) relative lengths of N people.
-        usual: before any people.
-        usual_people: number of people that it counts as, m.
+        usual: prior spread.
+        usual_people: weight m of the prior spread, in people.
 
     Raises:
         ValueError: fewer than two people.
@@ -127,7 +127,7 @@ def learned_spread(
     for _ in range(ITERATIONS):
         variance = 1.0 / (1.0 / stature + (1.0 / own).sum())
         mean = variance * (x / own).sum(1)
-        # N - 1 people are free of the mean.
+        # The mean takes one of the N degrees of freedom.
         left = variance * (len(x) - 1)
         stature = (usual_people * usual.stature**2 + mean @ mean + left) / total
         rest = ((x - mean[:, None]) ** 2).sum(0) + left
@@ -147,9 +147,9 @@ def log_likelihoods(relative: Array, mean: Array, covariance: Array) -> Array:
 def held_out(
     relative: Array, usual: LengthSpread, usual_people: float = USUAL_PEOPLE
 ) -> tuple[Array, Array]:
-    """Log likelihoods (N,) of each person by the others: learned spreads, usual ones, nats.
+    """Log likelihoods (N,) of each person given the others, for learned and usual spreads, nats.
 
-    Either is around the mean of the others, which is uncertain by itself.
+    Both use the mean of the others and include its uncertainty.
 
     Raises:
         ValueError: fewer than three people.

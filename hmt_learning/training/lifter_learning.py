@@ -1,7 +1,7 @@
-"""Learning of experts that know depth, from tracks of landmarks; and their scores.
+"""Learning of the lifter, a mixture of experts, from landmark tracks; and its scores.
 
-Distances in the loss (`network_learning`) are those of the joints from their true places, in the
-mean over joints.
+The distance in the loss (`network_learning`) is the mean distance of the joints from their true
+positions.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from hmt_ros.body import Body
 from hmt_ros.experts.lifter import MEANS, SPREAD, SPREADS, Lifter, Network
 from hmt_ros.inference.arrays import Array
 
-# Windows that a lifter is scored on.
+# Number of windows for the scores of a lifter.
 SCORED_WINDOWS = 2000
-# Joints whose mean distance from the truth, seen from the pelvis, is reported.
+# Joints for the reported mean distance from the truth, relative to the pelvis.
 SCORED = tuple(i for i, name in enumerate(JOINTS) if not name.endswith(('toe', 'hand', 'pelvis')))
 PELVIS = JOINTS.index('pelvis')
-# Least scale of an input.
+# Added to the scale of each input.
 LEAST_SCALE = 0.1
 
 
 @dataclass(frozen=True)
 class LearningSettings:
-    """How a lifter learns.
+    """Settings for the training of a lifter.
 
     Attributes:
-        units, layers: Width of the layers that experts share, and number of those that add.
-        rate: Of Adam, at its highest.
-        distance_weight: Factor a, 1/m.
+        units, layers: Width of the layers shared by all experts, and number of residual layers.
+        rate: Highest learning rate of Adam.
+        distance_weight: Factor a on the distances, 1/m.
         sharpness: Exponent b of the densities in q.
     """
 
@@ -69,17 +69,17 @@ def learn_lifter(
     resume: Path | None = None,
     taught: Lifter | None = None,
 ) -> Lifter:
-    """A lifter that has learned.
+    """Trains a lifter.
 
     Args:
-        body: with the usual lengths.
-        told: is called after each step, with its number and the loss.
-        resume: file in which the training is marked now and then, and taken up if it is there.
-        taught: a lifter to learn on from; None: from nothing.
+        body: body with the usual lengths.
+        told: callback after each step, with its number and the loss.
+        resume: checkpoint file; training resumes from it if it exists.
+        taught: trained lifter to start from; None starts from random weights.
 
     Raises:
-        ValueError: JAX or Optax is missing, the file to take up is of another training, or the
-            lifter to learn on from has another network.
+        ValueError: JAX or Optax is missing, the checkpoint is of another training, or `taught` has
+            another network.
     """
     check_tools()
     import jax
@@ -100,7 +100,7 @@ def learn_lifter(
         known = {name: np.asarray(getattr(before, name), np.float32) for name in first}
         sizes = {name: value.shape for name, value in first.items()}
         if {name: value.shape for name, value in known.items()} != sizes or taught.joints != JOINTS:
-            raise ValueError(f'the lifter to learn on from has another network: wanted {sizes}')
+            raise ValueError(f'the lifter to continue from has another network: wanted {sizes}')
         first, mean, scale, middle = known, before.mean, before.scale, before.middle
 
     def terms(p: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
@@ -120,12 +120,12 @@ def learn_lifter(
 
 @dataclass(frozen=True)
 class LifterScores:
-    """Scores of a lifter on windows.
+    """Scores of a lifter on test windows.
 
     Attributes:
-        heaviest, best: Mean distance of the scored joints from the truth, from the pelvis, m, of
-            the heaviest expert and of the best one.
-        log_density: Mean log density of the truth, nats a number.
+        heaviest, best: Mean distance of the scored joints from the truth, relative to the pelvis,
+            for the heaviest expert and for the best one, m.
+        log_density: Mean log density of the truth, nats per coordinate.
         within: Share of the true coordinates in the central 90 % of their marginal mixture.
     """
 
@@ -136,7 +136,7 @@ class LifterScores:
 
 
 def lifter_scores(lifter: Lifter, inputs: Any, joints: Any) -> LifterScores:
-    """Scores on windows: inputs (N, p) and joints (N, J, 3)."""
+    """Scores a lifter on windows: inputs (N, p) and joints (N, J, 3)."""
     gates, means, deviations = lifter.network(inputs)
     off = means - joints[:, None]
     each = gates - (0.5 * (off / deviations) ** 2 + np.log(deviations)).sum((2, 3))
@@ -155,7 +155,7 @@ def lifter_scores(lifter: Lifter, inputs: Any, joints: Any) -> LifterScores:
 
 
 def _within(gates: Array, off: Array, share: float = 0.9) -> Array:
-    """Whether truths are in the central share of marginals, by whitened offsets (N, K, J, 3)."""
+    """Whether true coordinates lie in the central share of their marginals (N, J, 3)."""
     below = np.einsum('nk,nkji->nji', np.exp(gates), ndtr(-off))
     return np.asarray(np.abs(below - 0.5) <= 0.5 * share)
 
@@ -163,7 +163,7 @@ def _within(gates: Array, off: Array, share: float = 0.9) -> Array:
 def scores_on(
     body: Body, tested: list[PoseSequence], lifter: Lifter, windows: WindowSettings
 ) -> dict[str, str]:
-    """Scores on motions of other people, as text by kind of keypoints."""
+    """Scores on motions of other people, as text for each kind of keypoints."""
     tracks = keypoint_tracks(body, tested, [1.0] * len(tested), variants=1)
     known = replace(
         windows,

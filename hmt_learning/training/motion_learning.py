@@ -1,17 +1,17 @@
 """Learning of the motion prior of a body from recorded motions.
 
-Velocities are damped and driven by coupled noise. The displacements of a degree of freedom over two
-intervals tau in a row have, at damping g, with velocities of the variance s and white noise W,
+Velocities are damped and driven by coupled noise. With damping g, velocity variance s and white
+noise W, the displacements of a degree of freedom over two consecutive intervals tau have
 
     var = 2 s / g^2 (g tau - e) + W tau,    cov = s / g^2 e^2,    e = 1 - exp(-g tau)
 
 g, s and W maximise the Gaussian likelihood of all pairs over intervals of 1/30 to 1/5 s (composite
 likelihood [Varin, Reid and Firth 2011]); its sufficient statistics are the two moments. The
 residuals of the second displacement, given the first, are correlated over the degrees of freedom:
-the couplings. A mirrored copy of every motion takes part, so that left and right move alike.
+the couplings. A mirrored copy of every motion is included, so that left and right are equal.
 
-The place of the camera is not learned: translations of the root are isotropic and not coupled, and
-only changes of the heading count.
+The prior does not depend on the camera: translations of the root are isotropic and not coupled, and
+only changes of the heading are used.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ from hmt_ros.body.mirror import mirror
 from hmt_ros.body.motion_prior import LearnedMotion
 from hmt_ros.inference.arrays import Array
 
-# Intervals, in frames of 30 Hz, and the one that couplings are measured at.
+# Intervals, in frames, and the one used for the couplings.
 INTERVALS = (1, 2, 3, 4, 5, 6)
 COUPLED = 3
-# Displacements are cut at this quantile of their size: larger ones are faults of recordings.
+# Quantile at which displacements are clipped; larger ones are recording errors.
 USUAL = 0.995
-# How far correlations are shrunk to 0.
+# Factor by which correlations are shrunk towards 0.
 SHRINKAGE = 0.05
-# Least variance that a pose gains per second besides, m^2 or rad^2: 3 mm or 0.2 degrees.
+# Minimum white-noise variance per second, m^2 or rad^2: 3 mm or 0.2 degrees.
 LEAST_WHITE = 1e-5
 # Bounds of the damping, per second.
 DAMPING = (0.2, 60.0)
-FEWEST = 200  # pairs of displacements that are needed
+FEWEST = 200  # minimum number of pairs of displacements
 
 
 def learned_motion(
     body: Body, sequences: Sequence[Array], rate: float, card: Mapping[str, Any] | None = None
 ) -> LearnedMotion:
-    """The motion prior of a body, from motions.
+    """Learns the motion prior of a body.
 
     Args:
-        sequences: motions, each poses (T, d), in the frame of a camera at rest.
+        sequences: poses (T, d) of each motion, in the frame of a camera at rest.
         rate: poses per second.
 
     Raises:
@@ -75,7 +75,7 @@ def learned_motion(
 
 
 def _displacements(body: Body, sequences: Sequence[Array], step: int) -> Array:
-    """Pairs (N, 2, d) of displacements over `step` frames, one after the other."""
+    """Pairs (N, 2, d) of consecutive displacements over `step` frames."""
     found = [np.empty((0, 2, body.dimension))]
     for poses in sequences:
         for seen in (poses, mirror(body, poses)):
@@ -89,7 +89,7 @@ def _displacements(body: Body, sequences: Sequence[Array], step: int) -> Array:
 
 
 def _groups(body: Body) -> list[list[int]]:
-    """Degrees of freedom that share their parameters: the translations, and the two sides."""
+    """Degrees of freedom with common parameters: translations, and left with right."""
     names = list(body.dof_names)
     groups: dict[str, list[int]] = {}
     for i, name in enumerate(names):
@@ -102,7 +102,7 @@ def _groups(body: Body) -> list[list[int]]:
 def _moments(pairs: Array, interval: float) -> tuple[float, float, float, float]:
     """Interval, variance and covariance of pairs (N, 2, m), and number of independent ones."""
     variance = float(np.mean(pairs**2))
-    # Intervals overlap.
+    # Overlapping intervals are not independent.
     count = len(pairs) * INTERVALS[0] / (interval * len(INTERVALS))
     return interval, variance, float(np.mean(pairs[:, 0] * pairs[:, 1])), count
 
@@ -110,7 +110,7 @@ def _moments(pairs: Array, interval: float) -> tuple[float, float, float, float]
 def modelled_moments(
     interval: float, damping: Array | float, variance: Array | float, white: Array | float
 ) -> tuple[Array, Array]:
-    """Variance and covariance of two displacements in a row; see above."""
+    """Variance and covariance of two consecutive displacements; see above."""
     g = np.asarray(damping, dtype=np.float64)
     lost = -np.expm1(-g * interval)
     var = 2.0 * variance / g**2 * (g * interval - lost) + white * interval
@@ -130,7 +130,7 @@ def _fitted(moments: Array) -> tuple[float, float, float]:
         g, s, w = np.exp(log)
         seen = [modelled_moments(float(t), g, s, w + LEAST_WHITE) for t in interval]
         v, c = np.array(seen).T
-        # In the sum and the difference of the two displacements, which are independent.
+        # Sum and difference of the two displacements are independent.
         both = np.log(v + c) + (var + cov) / (v + c) + np.log(v - c) + (var - cov) / (v - c)
         return float((count * both).sum())
 
@@ -148,7 +148,7 @@ def _fitted(moments: Array) -> tuple[float, float, float]:
 def _couplings(
     pairs: Array, damping: Array, variance: Array, white: Array, interval: float
 ) -> Array:
-    """Correlations (d, d) of the residuals of second displacements, given the first."""
+    """Correlations (d, d) of the residuals of second displacements given the first ones."""
     var, cov = modelled_moments(interval, damping, variance, white)
     surprise = pairs[:, 1] - cov / var * pairs[:, 0]
     both = surprise.T @ surprise / len(surprise)

@@ -2,12 +2,12 @@
 
     loss = -log sum_i g_i p_i / n + a sum_i q_i d_i,     q_i ~ g_i p_i^b
 
-The first part is the mixture density [Bishop 1994], of n numbers. Alone it improves means of small
-deviation; the second part, over the experts responsible for a target, improves the means where
-deviations are large: d_i is the distance of a mean from the target. q does not pass gradients. The
-rate of Adam falls as a cosine.
+The first term is the log density of the mixture [Bishop 1994] per number of a target, n in total.
+It mainly improves means with small deviations; the second term, over the experts responsible for a
+target, improves means with large ones: d_i is the distance of a mean from the target. No gradients
+pass through q. The learning rate of Adam falls as a cosine.
 
-JAX and Optax do the work; prediction needs neither. The same seed, steps and machine give the same
+Learning needs JAX and Optax, prediction neither. The same seed, steps and machine give the same
 bytes.
 """
 
@@ -33,32 +33,33 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-# Steps until the rate has risen, and between two marks of a training that can be taken up again.
+# Number of warm-up steps of the learning rate, and of steps between two checkpoints.
 RISING, MARK = 300, 500
-# At the end the rate is this share of the highest one.
+# Final learning rate, relative to the highest.
 END = 0.005
 NEEDED = 'a network needs JAX and Optax to learn, which are missing: pip install jax optax'
 
-# Least number of samples; clusters that give the support of an input, and samples for them.
+# Minimum number of samples; number of clusters for the support of an input, and of their samples.
 FEWEST, CENTRES, FOR_CENTRES = 20, 200, 20_000
 # Factor a on the distances of means, and exponent b of densities in the responsibilities.
 DISTANCE, SHARPNESS = 5.0, 0.5
 
-# From parameters, inputs and targets: log gates, log densities and distances, all (N, K).
+# Log gates, log densities and distances, all (N, K), from parameters, inputs and targets.
 Terms = Callable[[Any, Any, Any], tuple[Any, Any, Any]]
 
 
 @dataclass(frozen=True)
 class Descent:
-    """How a network learns.
+    """Settings of gradient descent.
 
     Attributes:
-        rate: Learning rate of Adam, at its highest.
-        distance_weight: Factor a.
+        steps: Number of steps.
+        rate: Highest learning rate of Adam.
+        distance_weight: Factor a on the distances.
         sharpness: Exponent b of the densities in q.
-        told: Is called after each step, with its number and the loss.
-        resume: File in which the training is marked now and then, and taken up if it is there.
-        settings: Text that tells one training from another.
+        told: Callback after each step, with its number and the loss.
+        resume: Checkpoint file; training resumes from it if it exists.
+        settings: Text that identifies the training; a checkpoint with another one is rejected.
     """
 
     steps: int
@@ -77,13 +78,13 @@ def learned_network(
     drawn: Callable[[int], tuple[Any, Any]],
     descent: Descent,
 ) -> dict[str, Any]:
-    """The parameters that have learned.
+    """Trains the parameters of a network.
 
     Args:
-        size: number of numbers in a target, n.
+        size: dimension n of a target.
 
     Raises:
-        ValueError: JAX or Optax is missing, or the file to take up is of another training.
+        ValueError: JAX or Optax is missing, or the checkpoint is of another training.
     """
     check_tools()
     import jax
@@ -131,13 +132,13 @@ def tools_are_there() -> bool:
 
 
 def check_tools() -> None:
-    """Raises ValueError where JAX or Optax is missing."""
+    """Raises ValueError if JAX or Optax is missing."""
     if not tools_are_there():
         raise ValueError(NEEDED)
 
 
 def first_layers(inputs: int, units: int, layers: int, outputs: int, seed: int) -> dict[str, Any]:
-    """Weights of layers before learning."""
+    """Random initial weights of the layers."""
     rng, f32 = np.random.default_rng([seed, -1 % 2**32]), np.float32
 
     def normal(*shape: int) -> Any:
@@ -149,7 +150,7 @@ def first_layers(inputs: int, units: int, layers: int, outputs: int, seed: int) 
         'hidden': normal(layers, units, units) * f32(1.0 / np.sqrt(units)),
         'hidden_biases': np.zeros((layers, units), f32),
         'last': normal(units, outputs) * f32(0.2 / np.sqrt(units)),
-        # Experts that begin as one stay one.
+        # Experts with equal initial weights would stay equal.
         'last_bias': 0.3 * normal(outputs),
     }
 
@@ -165,7 +166,7 @@ def layer_outputs(p: Any, x: Any) -> Any:
 
 
 def _ahead(drawn: Callable[[int], Any], steps: range) -> Iterator[tuple[int, Any]]:
-    """Steps with their random draws, made beside the step before."""
+    """Steps with their random draws; each is drawn in a thread during the step before."""
     with ThreadPoolExecutor(1) as beside:
         waiting = beside.submit(drawn, steps[0]) if steps else None
         for step in steps:
@@ -185,22 +186,22 @@ def _taken_up(path: Path, leaves: list[Any], settings: str) -> tuple[int, list[A
     with np.load(path, allow_pickle=False) as content:
         if str(content['settings']) != settings:
             raise ValueError(
-                f'{path} marks a training with other settings, {content["settings"]}: remove it, '
-                f'or wanted {settings}'
+                f'{path} records a training with other settings, {content["settings"]}: remove '
+                f'it, or wanted {settings}'
             )
         return int(content['step']), [content[f'leaf{i}'] for i in range(len(leaves))]
 
 
 class LearningNetwork(NetworkExperts):
-    """Experts of one network that learn; a file has them as `NetworkExperts`."""
+    """Trainable `NetworkExperts`; files store them as that class."""
 
     def fit(
         self, inputs: ArrayLike, targets: ArrayLike, sample_weight: ArrayLike | None = None
     ) -> Self:
-        """Learns from samples; see `ConditionalDensity.fit`.
+        """Fits the experts to samples; see `ConditionalDensity.fit`.
 
         Raises:
-            ValueError: as there, or JAX or Optax is missing.
+            ValueError: as `ConditionalDensity.fit`, or JAX or Optax is missing.
         """
         pairs = checked_pairs(inputs, targets, sample_weight, at_least=FEWEST, what='to learn from')
         self.n_inputs_, self.n_outputs_ = pairs.inputs.shape[1], pairs.targets.shape[1]
@@ -243,7 +244,7 @@ class LearningNetwork(NetworkExperts):
         return learned_network(first, terms, d, drawn, descent)
 
     def _clusters(self, x: Any) -> tuple[Array, float]:
-        """Clusters of inputs, and their spread."""
+        """Cluster centres of the inputs, and their root mean square distance from the inputs."""
         rng = np.random.default_rng(self.seed)
         some = x[np.sort(rng.permutation(len(x))[:FOR_CENTRES])].astype(np.float64)
         centres, own = k_means(some, min(CENTRES, len(some)), rng, iterations=5)

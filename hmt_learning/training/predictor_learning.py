@@ -1,4 +1,4 @@
-"""Learning of a pose predictor: its models by name, its training, and reports on ambiguity.
+"""Training of a pose predictor: its models by name, learning, and reports on ambiguity.
 
 The reports are those of BME 3: affinity matrices of poses and of descriptors (fig. 7), and the
 number of clusters of poses under one cluster of descriptors (fig. 6).
@@ -37,29 +37,30 @@ from hmt_ros.inference.clustering import k_means, squared_distances
 Progress = Callable[[Iterable[int], int], Iterable[int]]
 
 SAMPLES_PER_EXPERT = 40  # minimum for a linear expert of the joint model
-NEIGHBOURS = 40  # of the local model
-WIDTH = 3.0  # of the kernels of the conditional model's gates, in standard deviations of an input
+NEIGHBOURS = 40  # number of neighbours of the local model
+WIDTH = 3.0  # kernel width of the conditional model's gates, in standard deviations of an input
 
-FOR_DESCRIPTOR = 3000  # maximum number of silhouettes that the descriptor learns from
-FOR_BASIS = 600  # maximum number of poses that the metric of targets is averaged over
+FOR_DESCRIPTOR = 3000  # maximum number of silhouettes from which the descriptor is learned
+FOR_BASIS = 600  # maximum number of poses for the average metric of targets
 AWAY = 5.0  # depth of the poses in that average, m
-SMALLEST = 3e-3  # metric of a number that moves no joint, m per radian
-# Standard deviation of the noise that is added to previous states for the learning of dynamics, in
-# units of theirs: a previous state is an estimate, not the truth.
+SMALLEST = 3e-3  # metric of a component that moves no joint, m per radian
+# Noise added to previous states when dynamics are learned, because a previous state is an estimate:
+# standard deviation relative to that of the states.
 STATE_NOISE = 0.5
 
 
 @dataclass(frozen=True)
 class ModelKind:
-    """How a model is made.
+    """Constructor and default sizes of a kind of model.
 
     Attributes:
         make: Makes the model from a number of experts, a seed and, if known, the number of samples.
-            The baselines take the first as the number of neighbours, or ignore it.
-        components: Number of components of the descriptor that the model sees.
-        dynamics_experts: Number of experts of p(x_t | x_t-1, r_t); None takes M.
-        few: Whether each expert needs many samples, so that few samples have few experts.
-        folds: Number of parts of the motions for calibration; fewer where learning is slow.
+            The baselines use the first as the number of neighbours, or ignore it.
+        experts: Default number of experts M.
+        components: Number of components of the descriptor that are inputs of the model.
+        dynamics_experts: Number of experts of p(x_t | x_t-1, r_t); None selects M.
+        few: Whether the number of experts is limited by the number of samples.
+        folds: Number of parts of the motions for calibration; fewer for slow models.
     """
 
     make: Callable[[int, int, int | None], ConditionalDensity]
@@ -71,7 +72,7 @@ class ModelKind:
 
 
 def _local(experts: int, seed: int, samples: int | None) -> ConditionalDensity:
-    # A third of the samples is left out at a time, and the neighbours are among the others.
+    # Calibration leaves out a third of the samples; neighbours are among the others.
     neighbours = NEIGHBOURS if samples is None else max(min(NEIGHBOURS, samples // 3), 8)
     return LocalExperts(experts, neighbours, seed=seed)
 
@@ -112,7 +113,7 @@ KINDS = {
 
 
 def kinds() -> tuple[str, ...]:
-    """Names of the models that can learn here: a network needs JAX and Optax."""
+    """Names of the models that can learn here; the network needs JAX and Optax."""
     return tuple(name for name in KINDS if name != 'network' or tools_are_there())
 
 
@@ -122,10 +123,10 @@ def new_model(
     """A calibrated model before learning.
 
     Args:
-        experts: Number of experts M; None takes the default. Few samples have fewer.
+        experts: Number of experts M; None selects the default. Fewer for few samples.
 
     Raises:
-        ValueError: there is no such model.
+        ValueError: the name of the model is unknown.
     """
     if name not in KINDS:
         raise ValueError(f'no model {name!r}, wanted one of {", ".join(sorted(KINDS))}')
@@ -141,9 +142,9 @@ class Described:
     """Descriptors and targets of a training set.
 
     Attributes:
-        descriptors: (N, p).
-        targets, previous: (N, D) encoded poses, and those one step before.
-        motions: (N,) number of the motion of each sample.
+        descriptors: (N, p) descriptors of the silhouettes.
+        targets, previous: (N, D) encoded poses, and those one step earlier.
+        motions: (N,) index of the motion of each sample.
     """
 
     descriptor: SilhouetteDescriptor
@@ -155,7 +156,7 @@ class Described:
     def with_components(self, count: int) -> Described:
         """The training set with at most `count` components of the descriptor.
 
-        Full covariances of inputs need fewer components than distances to neighbours.
+        Models with full input covariances need fewer components than nearest neighbours.
         """
         count = min(count, self.descriptor.size)
         return replace(
@@ -174,8 +175,8 @@ def described(
     """Descriptors and targets of a training set.
 
     Args:
-        progress: Iterates over the silhouettes, given their number.
-        of_descriptor: see `learned_descriptor`.
+        progress: Shows the progress of an iteration, given an iterable and its length.
+        of_descriptor: Keyword arguments of `learned_descriptor`.
     """
     # Shape contexts of all silhouettes would fill the memory.
     some = np.sort(np.random.default_rng(0).permutation(len(pairs))[:FOR_DESCRIPTOR])
@@ -202,7 +203,7 @@ def learned_predictor(
     notes: dict[str, Any] | None = None,
     seed: int = 0,
 ) -> PosePredictor:
-    """A predictor that has learned from a training set.
+    """Trains a predictor on a training set.
 
     Args:
         model: Model that learns p(z | descriptor).
@@ -214,7 +215,7 @@ def learned_predictor(
     for name in ('descriptors', 'targets', 'previous'):
         finite_matrix(getattr(training, name), name, '(N, ...)')
     basis = target_basis(PoseEncoding(body), training.targets)
-    # States and descriptors get the same variance: dynamics measure distances over both.
+    # States and descriptors get the same variance, because dynamics measure distances over both.
     width = float((training.targets @ basis).var(0).sum())
     basis = basis * np.sqrt(training.descriptors.var(0).sum() / max(width, 1e-12))
     states = training.targets @ basis
@@ -242,10 +243,10 @@ def _learn(model: ConditionalDensity, inputs: Array, targets: Array, motions: In
 
 
 def target_basis(encoding: PoseEncoding, targets: Array) -> Array:
-    """(D, D) B such that |B' dx| is the distance that joints move for a change dx of a target, m.
+    """Basis B (D, D) such that |B' dx| is the motion of the joints for a target change dx, m.
 
-    The root mean square over all joints but the pelvis, averaged over the targets (N, D). A change
-    of a wrist then counts less than one of a hip.
+    It is the root mean square over all joints but the pelvis, averaged over the targets (N, D), so
+    that a change of a wrist counts less than that of a hip.
     """
     chosen = targets[:: max(len(targets) // FOR_BASIS, 1)][:FOR_BASIS]
     roots = np.tile([[0.0, 0.0, AWAY]], (len(chosen), 1))
@@ -271,11 +272,11 @@ def multimodality(inputs: Array, targets: Array, clusters: int, seed: int = 0) -
     """The number of clusters of targets under each cluster of inputs (BME fig. 6).
 
     Args:
-        inputs, targets: (N, p) and (N, D); they are clustered independently.
+        inputs, targets: (N, p) and (N, D) samples, which are clustered independently.
         clusters: Number of clusters of inputs, and of targets.
 
     Returns:
-        (H,) number of clusters of inputs under which 1, 2, ... H clusters of targets fall.
+        (H,) number of clusters of inputs with 1, 2, ... H clusters of targets.
 
     Raises:
         ValueError: there are more clusters than samples.

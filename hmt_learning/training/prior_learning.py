@@ -2,16 +2,16 @@
 
 Motions become poses of the body, and poses that are nearly equal are dropped. The number of poses
 of a motion is limited, and the weight of a person is the square root of the number of poses.
-Every pose counts as its mirror image as well. The number of components is that with the largest
-likelihood of people who are left out; their mean is over people.
+Every pose is used with its mirror image, too. The number of components maximises the likelihood of
+people who are left out, as a mean over people.
 
 Expectation maximisation of Gaussian mixtures over angles and their mirror images.
 
     p(a) = w_0 N(a; m_0, S_0) + (1 - w_0) sum_k w_k/2 [N(a; m_k, S_k) + N(Ra; m_k, S_k)]
 
-A sample a and its mirror image Ra are one sample that may be seen either way round: K components
-stand for 2 K, and the density of a pose is that of its mirror image. Component 0 is given. The
-covariances have an inverse Wishart prior of v samples with the scatter B; every iteration raises
+A sample a and its mirror image Ra have the same density, so K components stand for 2 K. Component 0
+is fixed. The covariances have an inverse Wishart prior of v samples with the scatter B; every
+iteration increases
 
     F = sum_n s_n log p(a_n) - v/2 sum_k [log |S_k| + tr(B S_k^-1)]
 """
@@ -32,7 +32,7 @@ from hmt_ros.body.mirror import mirror
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.mixture import GaussianMixture
 
-# An angle whose standard deviation within a motion is smaller was not recorded, rad.
+# Minimum standard deviation within a motion of an angle that was recorded, rad.
 STILL = np.radians(0.5)
 
 Progress = Callable[[Iterable[int], int], Iterable[int]]
@@ -42,11 +42,11 @@ LEAST_SAMPLES = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class MirroredSamples:
-    """Samples that may be seen either way round.
+    """Samples with their mirror images.
 
     Attributes:
         angles, images: (N, n) samples and their mirror images, rad.
-        weights: (N,) number of independent samples that each stands for.
+        weights: (N,) effective number of independent samples of each.
     """
 
     angles: Array
@@ -71,7 +71,7 @@ class CovariancePrior:
     """The inverse Wishart prior of the covariances.
 
     Attributes:
-        samples: v.
+        samples: v, the number of samples that the prior is worth.
         scatter: (n, n) B, rad^2.
     """
 
@@ -85,11 +85,11 @@ class CovariancePrior:
 
 
 def mirrored_log_densities(mixture: GaussianMixture, angles: Array, images: Array) -> Array:
-    """Logarithms (N, 2 K + 1) of the terms of p: the components, of the images, the broad one.
+    """Log terms (N, 2 K + 1) of p: components at the angles, at the images, and the broad one.
 
     Args:
         mixture: component 0, then K components.
-        angles, images: (N, n).
+        angles, images: (N, n) samples and their mirror images, rad.
     """
     with np.errstate(divide='ignore'):
         log_weights = np.log(mixture.weights)
@@ -106,7 +106,7 @@ def mirrored_log_densities(mixture: GaussianMixture, angles: Array, images: Arra
 
 
 def seeds_of(samples: MirroredSamples, count: int, rng: np.random.Generator) -> Array:
-    """Samples (K, n) that are far from each other, drawn as k-means++ does."""
+    """Samples (K, n) far from each other, drawn as in k-means++."""
     scale = np.sqrt(np.maximum(np.diagonal(samples.scatter()[1]), 1e-12))
     chosen: list[Array] = []
     nearest = np.ones(len(samples.angles))
@@ -128,11 +128,11 @@ def fitted_mixture(
     iterations: int = 100,
     tolerance: float = 1e-3,
 ) -> tuple[GaussianMixture, list[float]]:
-    """The mixture that EM reaches.
+    """Fits a mixture by expectation maximisation.
 
     Args:
-        start: component 0, which stays as it is, then K components; weights sum to 1.
-        tolerance: gain of an iteration at which the iterations end, nats per sample.
+        start: component 0, which stays fixed, then K components; weights sum to 1.
+        tolerance: minimum increase of F in an iteration, nats per sample; EM ends below it.
 
     Returns:
         The mixture, and F before each iteration.
@@ -170,19 +170,19 @@ class PriorSettings:
     """Settings of the learning.
 
     Attributes:
-        components: Numbers of components that are tried; a mirror image is none of its own.
-        folds: Number of groups of people of which one at a time is left out.
-        novelty: Mean distance of the joints from the last pose kept, below which a pose of a motion
-            is dropped, m.
-        shrinkage: Number of poses for which the covariance of all poses counts in that of a
-            component.
-        compactness: Factor on that covariance.
-        bandwidth: Deviation of other people and other ways to measure from those of a component,
+        components: Candidate numbers of components; mirror images do not count.
+        folds: Number of groups of people for cross-validation.
+        novelty: Minimum mean joint distance of a pose from the last kept pose of its motion, m;
+            closer poses are dropped.
+        most_poses: Maximum number of poses of a motion.
+        shrinkage: Weight of the covariance of all poses in that of a component, number of poses.
+        compactness: Factor on the covariance of all poses in this use.
+        bandwidth: Standard deviation added to each component for other people and measurements,
             relative to the standard deviation of an angle over all poses.
-        broad_weight: Weight of the broad component, the Gaussians of the body's model file: no
-            pose costs more than log(1 / weight) nats beyond what it costs under these.
+        broad_weight: Weight of the broad component, the Gaussians of the body's model file. The
+            energy of a pose exceeds that under these Gaussians by log(1 / weight) nats at most.
         iterations: Maximum number of iterations of EM.
-        seed: Seed of the starts.
+        seed: Seed of the initial means.
     """
 
     components: tuple[int, ...] = (2, 4, 8, 12, 16)
@@ -212,8 +212,8 @@ class LearnedPrior:
     Attributes:
         mixture: the prior.
         held_out: number of components -> log likelihood of people left out, nats per pose.
-        plain: that of the Gaussians of the body's model file.
-        poses, motions, people: numbers of those that it was learned from.
+        plain: log likelihood of the Gaussians of the body's model file, nats per pose.
+        poses, motions, people: numbers of poses, motions and people in the training data.
     """
 
     mixture: AngleMixture
@@ -229,9 +229,9 @@ class PriorData:
     """Poses to learn from, motion by motion.
 
     Attributes:
-        body: of the poses.
-        poses: of each motion, (T, d).
-        people: of each motion, the person.
+        body: body of the poses.
+        poses: poses (T, d) of each motion.
+        people: name of the person of each motion.
     """
 
     body: Body
@@ -249,7 +249,7 @@ class PriorData:
         )
 
     def samples(self, dofs: Index) -> MirroredSamples:
-        """The poses as samples of some angles; a person's weight is the root of their number.
+        """The poses as samples of some angles; a person's weight is the root of the pose count.
 
         Args:
             dofs: (n,) degrees of freedom.
@@ -265,7 +265,7 @@ class PriorData:
         """Mean over the people of the mean of a log density over their poses.
 
         Args:
-            log_density: of poses (N, d).
+            log_density: log density (N,) as a function of poses (N, d).
         """
         own = [np.concatenate(self.of([x]).poses) for x in sorted(set(self.people))]
         return float(np.mean([log_density(poses).mean() for poses in own]))
@@ -274,7 +274,7 @@ class PriorData:
 def prior_data(
     body: Body, sequences: Sequence[PoseSequence], people: Sequence[str], settings: PriorSettings
 ) -> PriorData:
-    """The poses of motions, without those that are nearly equal, up to a number of each."""
+    """Poses of motions without near duplicates, at most `most_poses` of each."""
     kept = []
     for sequence in sequences:
         frames = novel_frames(body, sequence.poses, settings.novelty)
@@ -286,9 +286,9 @@ def prior_data(
 
 
 def recorded_dofs(body: Body, sequences: Sequence[PoseSequence], people: Sequence[str]) -> Index:
-    """The angles (n,) that motions show: those that move with more than half of the people.
+    """Indices (n,) of the recorded angles: those that move in more than half of the people.
 
-    Angles of the root are left out: heading of the person and lean of the camera are no posture.
+    Root angles are excluded: the person's heading and the camera's tilt are not posture.
     """
     moves = {
         person: np.median(
@@ -298,7 +298,7 @@ def recorded_dofs(body: Body, sequences: Sequence[PoseSequence], people: Sequenc
         for person in set(people)
     }
     share = np.mean([x > STILL for x in moves.values()], axis=0)
-    # Both sides or none.
+    # Angles of the left and the right side are covered together or not.
     share = np.minimum(share, np.abs(mirror(body, share[None])[0]))
     skeleton = body.skeleton
     inner = skeleton.dof_is_rotation & (skeleton.dof_segments > 0)
@@ -315,9 +315,9 @@ def learned_prior(
     """Learns a prior.
 
     Args:
-        dofs: (n,) angles that it covers.
+        dofs: (n,) angles that the prior covers.
         card: description of the data, text by heading.
-        progress: iterates over the numbers of components, given how many.
+        progress: shows the progress of an iteration, given an iterable and its length.
 
     Raises:
         ValueError: fewer people than groups, or no angles.
@@ -360,7 +360,7 @@ def _mixture(
     means = seeds_of(samples, count, np.random.default_rng(s.seed))
     n = len(dofs)
     broad = np.diag(body.prior_sigma[dofs] ** 2)
-    # A floor, for angles that hardly move together.
+    # A floor, so that covariances are not singular.
     floor = np.diag(np.diagonal(everything)) * 0.01 + 1e-6 * np.eye(n)
     prior = CovariancePrior(s.shrinkage, s.compactness * everything + floor)
     start = GaussianMixture(

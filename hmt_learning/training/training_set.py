@@ -1,4 +1,4 @@
-"""Training pairs of silhouettes and poses: motions seen from all around (BME 3).
+"""Training pairs of silhouettes and poses, from motions seen from all sides (BME 3).
 
 Recorded or procedural motions become poses of one body, and poses that are nearly equal are
 dropped. Some are mirrored left to right, some get the arms and trunk of another pose. Each is
@@ -46,11 +46,11 @@ MOTION_SUFFIXES = ('.bvh', '.amc')
 # Orientation of a level camera that looks along the world's y axis.
 LEVEL = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
 SIDE = 224  # of a training image, px
-FILLED = 0.86  # share of it that the largest person of a group fills
-ROOM = 0.36  # length of the flesh beyond the joints, both ends together, m
+FILLED = 0.86  # share of the image side that the largest person of a group fills
+ROOM = 0.36  # flesh beyond the outermost joints, sum of both ends, m
 GROUP = 16  # silhouettes of one person
 LEGS = ('hip', 'knee', 'ankle')
-# Where people are cut, from the pelvis to the neck as a share of the way; light from everywhere.
+# Range of the height of a cut, as a fraction from pelvis to neck; range of the ambient light.
 WAIST, NECK, CUT = 'pelvis', 'neck', (-0.15, 0.45)
 AMBIENT = (0.4, 0.8)
 
@@ -61,20 +61,20 @@ class TrainingSettings:
 
     Attributes:
         samples: Number of pairs.
-        novelty: Mean distance of the joints from the last pose kept, below which a pose of a motion
-            is dropped, m.
+        novelty: Minimum mean joint distance of a pose from the last kept pose of its motion, m;
+            closer poses are dropped.
         mirrored: Share of poses that are mirrored left to right.
         mixed: Share of poses whose trunk, head and arms are those of another pose.
         elevation, elevation_spread: Angle by which the camera looks down, mean and standard
-            deviation, degrees; it stays between -20 and 50.
+            deviation, degrees; clipped to -20 to 50.
         roll_spread: Standard deviation of the roll of the camera, degrees.
         distances: Minimum and maximum distance of the camera to the person, m.
         length_spread: Relative standard deviation of each segment length.
         width_range: Range of the factor on the thickness of the whole body.
         width_spread: Relative standard deviation of the thickness of each part.
-        boundary_noise: Standard deviation of the outline, px of a person 200 px tall.
-        dressed: Share of the people who are drawn in clothes; of others edges inside are unknown.
-        cut: Share of the people who are cut off somewhere about the waist.
+        boundary_noise: Standard deviation of the outline, px at a person height of 200 px.
+        dressed: Share of people rendered with clothes; others have no edges in the silhouette.
+        cut: Share of silhouettes that are cut off near the waist.
         seed: Seed of all random choices.
 
     Raises:
@@ -139,9 +139,9 @@ class TrainingSet:
 
     Attributes:
         poses: (N, d) in the frame of the image's camera.
-        previous: (N, d) of the same person 1 / RATE s before.
-        packed: (N, SIDE, SIDE / 8) silhouettes, bits.
-        edges: (N, EDGES) inside them, see `internal_edges`; NaN: unknown.
+        previous: (N, d) poses of the same person 1 / RATE s earlier.
+        packed: (N, SIDE, SIDE / 8) silhouettes, packed bits.
+        edges: (N, EDGES) edges inside the silhouettes, see `internal_edges`; NaN if unknown.
         activities: (N,) activity of each pair.
         sequences, frames: (N,) sequence and frame of each pose.
     """
@@ -162,7 +162,7 @@ class TrainingSet:
         return np.unpackbits(self.packed[sample], axis=1)
 
     def parts(self, sample: int, points: int = 100) -> SilhouetteParts:
-        """The descriptions of a sample, with so many points on the outline."""
+        """Parts of a sample's descriptor, from `points` points on the outline."""
         found = silhouette_parts(self.mask(sample), points)
         return replace(found, edges=self.edges[sample].astype(np.float64))
 
@@ -171,7 +171,7 @@ def motion_files(folder: Path) -> list[Path]:
     """The motion files in a folder and its subfolders, in a fixed order.
 
     Raises:
-        ValueError: there is no such folder, or no motion in it.
+        ValueError: the folder does not exist or contains no motion.
     """
     wanted = ' or '.join(MOTION_SUFFIXES)
     if not folder.is_dir():
@@ -233,7 +233,7 @@ def training_set(
 
     Args:
         body: Body of the poses, with flesh.
-        shares: Share of the poses of each motion that are taken; None: all.
+        shares: Share of each motion's poses that is used; None uses all.
 
     Raises:
         ValueError: there are no motions, or the body has no flesh or another root.
@@ -245,7 +245,7 @@ def training_set(
     rng = np.random.default_rng(s.seed)
     pool = [novel_frames(body, sequence.poses, s.novelty) for sequence in sequences]
     if shares is not None:
-        # Always some of them, at even intervals.
+        # Evenly spaced frames, at least one of each motion.
         pool = [x[:: round(1.0 / max(y, 1e-3))] for x, y in zip(pool, shares, strict=True)]
     which = np.repeat(np.arange(len(pool)), [len(x) for x in pool])
     frames = np.concatenate(pool)
@@ -275,7 +275,7 @@ def training_set(
 def _drawn_people(
     person: Body, poses: Array, s: TrainingSettings, rng: np.random.Generator
 ) -> Iterator[tuple[Bytes, Bytes | None]]:
-    """Masks and grey levels (SIDE, SIDE) of a person at poses (n, d); None: not in clothes."""
+    """Masks and grey levels (SIDE, SIDE) of a person at poses (n, d); grey None if bare."""
     camera = _fitting_camera(person, poses)
     dressed = rng.random() < s.dressed
     light = (*rng.normal(size=2).tolist(), 1.0)
@@ -299,7 +299,7 @@ def _drawn_people(
 
 
 def novel_frames(body: Body, poses: Array, distance: float) -> Index:
-    """Frames (n,) of poses (T, d) that differ from the last one kept, whatever the heading."""
+    """Indices (n,) of poses (T, d) that differ from the last one kept, ignoring the heading."""
     still = poses.copy()
     still[:, :3] = 0.0
     still[:, 3] = 0.0
@@ -320,7 +320,7 @@ def _drawn(available: int, count: int, rng: np.random.Generator) -> Index:
 
 
 def _moments(sequences: Sequence[PoseSequence], which: Index, frames: Index) -> tuple[Array, Array]:
-    """Poses (N, d), and those one step before; before its first frame a motion stands still."""
+    """Poses (N, d) and those one step earlier; the first frame of a motion precedes itself."""
     moments = list(zip(which.tolist(), frames.tolist(), strict=True))
     poses = np.stack([sequences[i].poses[t] for i, t in moments])
     previous = np.stack([sequences[i].poses[max(t - 1, 0)] for i, t in moments])
@@ -330,7 +330,7 @@ def _moments(sequences: Sequence[PoseSequence], which: Index, frames: Index) -> 
 def _mixed(
     body: Body, poses: Array, previous: Array, share: float, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Gives a share of the poses the trunk, head and arms of another one."""
+    """Replaces trunk, head and arms in a share of the poses by those of another pose."""
     names = body.dof_names
     upper = np.array(
         [i >= AXES and not any(leg in name for leg in LEGS) for i, name in enumerate(names)]
@@ -379,7 +379,7 @@ def _seen(
 
 
 def random_build(body: Body, s: TrainingSettings, rng: np.random.Generator) -> Body:
-    """A body with the random lengths and widths of the persons of a training set."""
+    """A body with random lengths and widths, as for the persons of a training set."""
     lengths = {
         name: value * (1.0 + s.length_spread * rng.normal())
         for name, value in body.segment_lengths.items()
@@ -401,7 +401,7 @@ def _fitting_camera(body: Body, poses: Array) -> Camera:
 
 
 def _uneven(mask: Bytes, deviation: float, rng: np.random.Generator) -> Bytes:
-    """The mask with its outline moved by smooth noise, px of a person 200 px tall."""
+    """The mask with its outline shifted by smooth noise, px at a person height of 200 px."""
     noise = rng.normal(size=mask.shape).astype(np.float32)
     if deviation == 0 or not mask.any():
         return mask
@@ -434,7 +434,7 @@ def seen_from(
             180 away from the camera, degrees.
         elevation: Angle by which the camera looks down, degrees.
         distance: Distance of the camera, m.
-        boundary_noise: Standard deviation of the outline, px of a person 200 px tall.
+        boundary_noise: Standard deviation of the outline, px at a person height of 200 px.
 
     Returns:
         Poses (n, d) with the middle of the joints on the optical axis, and silhouettes

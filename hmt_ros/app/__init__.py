@@ -11,14 +11,14 @@ COMMANDS = {
         'hmt_ros.app.import_video.command',
         'write a video and the keypoints of a detector into a bag',
     ),
-    'lift': ('hmt_ros.app.lift', 'tell the poses of a person from keypoints alone'),
+    'lift': ('hmt_ros.app.lift', 'estimate the poses of a person from keypoints alone'),
     'replay': (
         'hmt_ros.app.replay.command',
         'track the person in a bag and write the poses into a new bag',
     ),
     'install-detector': (
         'hmt_ros.app.install_detector',
-        'install a detector of keypoints: MediaPipe Pose, alone or with MoveNet',
+        'install a keypoint detector: MediaPipe Pose, alone or with MoveNet',
     ),
     'report': (
         'hmt_ros.app.report.command',

@@ -32,11 +32,11 @@ class CommandParser(argparse.ArgumentParser):
             '--debug',
             action='store_true',
             default=argparse.SUPPRESS,
-            help='print the traceback of an error, and what libraries print',
+            help='print the traceback of an error, and the output of libraries',
         )
 
     def error(self, message: str) -> NoReturn:
-        """Raises ValueError."""
+        """Raises ValueError instead of ending the process."""
         raise ValueError(f'{message}; see --help')
 
     def add_output(self, metavar: str, what: str, text: str, *, required: bool = True) -> None:
@@ -62,8 +62,8 @@ class CommandParser(argparse.ArgumentParser):
             type=float,
             nargs=3,
             metavar=('X', 'Y', 'Z'),
-            help='direction of gravity, of any length; x to the right of the image, y down, z '
-            'forward (default: not known)',
+            help='direction of gravity, three numbers of any scale: x to the right of the image, '
+            'y down, z forward (default: not known)',
         )
 
     def add_mixtures(self, verb: str) -> None:
@@ -111,8 +111,8 @@ usage: python -m {program} <command> [arguments]
 commands:
 {commands}
 
-python -m {program} <command> --help lists the arguments of a command. Whatever ends one early is
-told in one line on stderr; --debug behind the name of the command adds the traceback.
+python -m {program} <command> --help lists the arguments of a command. An error is reported in one
+line on stderr; --debug after the name of the command adds the traceback.
 {more}
 options:
   -h, --help  show this help
@@ -133,7 +133,7 @@ def run_program(
         program: name of the package.
         commands: module and description by name; a module is imported when its command runs.
         about, more: texts of the help, before and after the commands.
-        argv: name and arguments of the command; None: those of the process.
+        argv: name and arguments of the command; None selects those of the process.
 
     Returns:
         The exit code: 0 when done, 1 for bad input (one line on stderr explains it).
@@ -169,10 +169,10 @@ def run_command(
     """Runs a command with its arguments.
 
     Args:
-        parser: parser of its arguments; `prog` is the name of the command.
+        parser: argument parser of the command; `prog` is the name of the command.
         work: function of the command; it raises ValueError or OSError on bad input.
-        argv: arguments; None: those of the process.
-        whole_or_nothing: whether an interrupted command writes nothing; a line then reports this.
+        argv: arguments of the command; None selects those of the process.
+        whole_or_nothing: whether an interrupted command writes nothing, which is then reported.
 
     Returns:
         The exit code of `work`, or of `last_resort` after an exception.
@@ -191,17 +191,17 @@ def run_command(
 def number(
     low: float, high: float, *, what: str = 'a number', unit: str = ''
 ) -> Callable[[str], float]:
-    """Returns a parser of a number in a range; its errors name the range and the unit."""
+    """Returns a parser for numbers in a range; its errors name the range and the unit."""
     return _reader(float, low, high, f'{what} from {low:g} to {high:g}{unit}')
 
 
 def whole_number(low: int, high: int = 2**63 - 1) -> Callable[[str], int]:
-    """Returns a parser of a whole number in a range."""
+    """Returns a parser for whole numbers in a range."""
     return _reader(int, low, high, f'a whole number from {low} to {high}')
 
 
 def _reader(kind: type[Number], low: float, high: float, wanted: str) -> Callable[[str], Number]:
-    """Returns a parser of a number of a type in a range."""
+    """Returns a parser for numbers of a type in a range."""
 
     def read(text: str) -> Number:
         with suppress(ValueError):

@@ -1,4 +1,4 @@
-"""evaluate: errors and calibration of the mixtures in a bag against ground truth.
+"""evaluate: computes errors and calibration of the mixtures in a bag against ground truth.
 
 Each topic of pose mixtures or trajectory mixtures is one track; the bag is read once, in order.
 """
@@ -41,14 +41,14 @@ positions, after the pelvis was moved to its true position (or, if the truth has
 middle of the hips): of the heaviest component, of the best of all components, and the weighted mean
 over all components. A frame is lost when even the best component has an error of 150 mm or more.
 The negative log-likelihood is that of the true joint positions (m), in nats; lower is better.
-Coverage is the fraction of frames in which the truth lies in the smallest region that holds 50 or
-90 percent of the probability of the mixture, for all joints together and for each joint alone: the
-regions of a calibrated mixture cover 50 and 90 percent of the frames.
+Coverage is the fraction of frames in which the truth lies in the smallest region that contains 50
+or 90 percent of the probability of the mixture, for all joints together and for each joint alone:
+the regions of a calibrated mixture cover 50 and 90 percent of the frames.
 
-Where the truth has gravity and camera_height, the feet of the heaviest component are compared with
-the floor: how deep ankles and toes lie below it, and how fast the ankles of feet that truly stand
-(contact) slide over it. The vertical of a topic `ground` is compared with gravity: whether it was
-given or estimated shows in how well it is said to be known.
+If the truth has gravity and camera_height, the feet of the heaviest component are compared with the
+floor: the depth of ankles and toes below it, and the sliding speed of the ankles whose feet truly
+stand (contact). The vertical in a topic `ground` is compared with gravity; its stated standard
+deviation shows whether it was given or estimated.
 
 examples:
   evaluate out --truth truth.npz             print a table
@@ -74,7 +74,7 @@ def _parser() -> CommandParser:
         type=number(0, 1, what='a length', unit=' m'),
         default=MODEL_SIGMA,
         metavar='M',
-        help='standard deviation, in m, of each coordinate of a joint that is added to the '
+        help='standard deviation of each joint coordinate, in m, that is added to the '
         f'covariances of the mixture (default: {MODEL_SIGMA:g})',
     )
     parser.add_argument(
@@ -143,7 +143,7 @@ def as_json(
 
 
 def _finite(value: Any) -> Any:
-    """The value with None in place of infinity and NaN, which JSON does not have."""
+    """Replaces infinity and NaN, which JSON does not have, by None."""
     if isinstance(value, dict):
         return {key: _finite(each) for key, each in value.items()}
     if isinstance(value, list):
@@ -156,7 +156,7 @@ def as_text(
     truth: Truth,
     verticals: Mapping[str, GravityScores] | None = None,
 ) -> str:
-    """Tables for people: one row per topic, and the errors joint by joint."""
+    """Tables as text: one row per topic, then the errors of each joint."""
     found = {one_line(name, LONGEST_CELL): topic for name, topic in found.items()}
     rows: list[tuple[str, ...]] = [
         (
@@ -239,16 +239,16 @@ def score_bag(
     seed: int = 0,
     progress: Callable[[int], object] = lambda count: None,
 ) -> dict[str, TrackScores]:
-    """Computes the scores of the topics of a bag, by name.
+    """Computes the scores of each topic of a bag, by topic name.
 
     Args:
-        topics: names of the topics to score; empty: all topics with mixtures.
+        topics: names of the topics to score; empty selects all topics with mixtures.
         model_sigma: see `hmt_ros.evaluation.pose_scores`, m.
-        body_model: name or file of the body model, if the name in the bag is unknown; None: the
+        body_model: name or file of the body model, if the name in the bag is unknown; None uses the
             name in the bag.
 
     Raises:
-        ValueError: no mixtures, invalid messages, or no frame with a truth.
+        ValueError: no mixtures, invalid messages, or no frame with ground truth.
     """
     with BagReader(path) as bag:
         names = chosen_topics(bag, topics)
@@ -265,7 +265,7 @@ def score_bag(
 
 
 def score_gravity(path: Path, truth: Truth) -> dict[str, GravityScores]:
-    """Computes the scores of the verticals in a bag by topic, if the true one is known.
+    """Computes scores of the estimated vertical by topic, if the true vertical is known.
 
     Raises:
         ValueError: invalid messages.
@@ -284,15 +284,15 @@ def score_gravity(path: Path, truth: Truth) -> dict[str, GravityScores]:
 
 
 def chosen_topics(bag: BagReader, wanted: Iterable[str]) -> list[str]:
-    """Names of the wanted topics of mixtures in a bag, or of all except ground truth.
+    """Names of the wanted topics with mixtures; by default all in the bag except ground truth.
 
     Raises:
-        ValueError: no topic has mixtures, or a wanted one has none.
+        ValueError: no topic has mixtures, or a wanted topic has none.
     """
     poses = [x.name for x in bag.topics_of(POSE_MIXTURE) if not is_truth(bag, x.name)]
     trajectories = [x.name for x in bag.topics_of(TRAJECTORY_MIXTURE)]
     present = [*poses, *trajectories] or [
-        topic.name  # images that show nobody
+        topic.name  # topics without messages, because nobody was in view
         for topic in bag.topics.values()
         if topic.msgtype == POSE_MIXTURE and not topic.message_count
     ]

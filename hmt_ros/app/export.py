@@ -1,4 +1,4 @@
-"""export: the motion of a recorded run as a file for other programs.
+"""export: writes the motion of a recorded run into a file for other programs.
 
 export out -o walk.bvh
 """
@@ -37,23 +37,23 @@ from msg_tools.messages.pose_mixtures import (
 FORMATS = ('.bvh', '.csv', '.npz')
 # Radius of the 90 % region of a 3D Gaussian, in units of its largest standard deviation.
 RADIUS_90 = 2.5003
-# Factor by which an interval exceeds the median one to be a gap.
+# Minimum length of a gap between poses, in median intervals.
 _GAP = 1.5
-# Turn of the vertical above which the camera has moved, degrees.
+# Maximum rotation of the vertical for a static camera, degrees.
 _STILL = 5.0
 
 EPILOG = """\
-The ending of OUT selects the format.
+The suffix of OUT selects the format.
   .bvh  joints and their angles at even times, m, for Blender and other programs
   .csv  a row for each stamp: joint positions and their 90 % radii, m
   .npz  arrays: poses, joint positions, covariances, weights, lengths
 
-A BVH stands upright, y up, the floor at y = 0, where the bag knows gravity and floor; else it is in
-the axes of the mixtures, x right, turned from y down and z forward to y up and z back. Tables and
-arrays stay in the frame of the mixtures.
+A BVH is upright, with y up and the floor at y = 0, if the bag has gravity and floor; otherwise it
+has the axes of the mixtures, x right, turned from y down and z forward to y up and z back. Tables
+and arrays are in the frame of the mixtures.
 
-Without --identity each pose is the heaviest mode of its time, which may leap from one motion to
-another; with it all poses are of one motion, for as long as that lasts.
+Without --identity each pose is the heaviest mode at its time, which may jump from one motion to
+another; with it all poses belong to one motion, for as long as that motion lasts.
 
 examples:
   export out -o walk.bvh
@@ -81,12 +81,12 @@ class TrackedPose:
 
 @dataclass(frozen=True, eq=False)
 class TrackedMotion:
-    """One pose at each of T times, of one track on one topic.
+    """The motion of one track on one topic: one pose at each of T times.
 
     Attributes:
         topic: topic of the mixtures.
         steps: (T,) poses in the order of their stamps.
-        of: the last mixture, for the fields that are the same in all mixtures.
+        of: the last mixture, used for fields that are equal in all mixtures.
         body: body with the segment lengths of the last mixture; None if unknown.
         room: (3, 3) rotation from the frame of the mixtures to axes with y up.
         height: height of the camera above the floor, m; 0 if unknown.
@@ -119,8 +119,8 @@ class TrackedMotion:
         """
         if self.body is None:
             raise ValueError(
-                f'{self.topic}: the body {self.of.body_model!r} is not known: --body names its '
-                'model, and .csv and .npz need none'
+                f'{self.topic}: the body {self.of.body_model!r} is not known: name its model '
+                'with --body, or write .csv or .npz, which need none'
             )
         poses = np.array([step.pose for step in self.steps])
         return MovingSkeleton.of_body(self.body, poses, self.times, self.room, self.height)
@@ -146,7 +146,7 @@ def _parser() -> CommandParser:
         '--identity',
         type=whole_number(1),
         metavar='N',
-        help='the motion of this identity (default: the heaviest mode at each time)',
+        help='export the motion with this identity (default: the heaviest mode at each time)',
     )
     parser.add_argument(
         '--track', type=whole_number(0), metavar='N', help='track_id (default: the longest track)'
@@ -155,10 +155,12 @@ def _parser() -> CommandParser:
         '--fps',
         type=number(0.01, 1e4),
         metavar='RATE',
-        help='poses a second of a .bvh (default: as recorded)',
+        help='frame rate of a .bvh, 1/s (default: as recorded)',
     )
     parser.add_argument(
-        '--camera-axes', action='store_true', help='do not turn upright though gravity is known'
+        '--camera-axes',
+        action='store_true',
+        help='do not turn the motion upright even if gravity is known',
     )
     parser.add_argument(
         '--body',
@@ -202,7 +204,7 @@ def motion_bytes(motion: TrackedMotion, kind: str, rate: float | None = None) ->
 
     Args:
         kind: one of `FORMATS`.
-        rate: poses per second of a .bvh; None: the median rate of the motion.
+        rate: poses per second of a .bvh; None selects the median rate of the motion.
 
     Raises:
         ValueError: a .bvh is wanted and the body is unknown, or there are too many poses.
@@ -218,7 +220,7 @@ def motion_bytes(motion: TrackedMotion, kind: str, rate: float | None = None) ->
 
 
 def _table(motion: TrackedMotion) -> str:
-    """A table with one row per time; it has no radii if covariances are unknown."""
+    """Text of a .csv with one row per time; radii are left out if covariances are unknown."""
     covariances = _all([step.joint_covariances for step in motion.steps])
     columns = ['x', 'y', 'z']
     numbers = np.array([step.joints for step in motion.steps])
@@ -238,7 +240,7 @@ def _table(motion: TrackedMotion) -> str:
 
 
 def _arrays(motion: TrackedMotion) -> dict[str, Any]:
-    """Arrays by name; covariances are left out if unknown."""
+    """Arrays of a .npz by name; covariances are left out if unknown."""
     steps, of = motion.steps, motion.of
     names = list(of.segment_lengths)
     result = {
@@ -279,13 +281,13 @@ def read_tracked_motion(
     camera_axes: bool = False,
     progress: Callable[[int], object] = lambda count: None,
 ) -> TrackedMotion:
-    """Reads the motion of a recorded run; the first of several poses with one stamp counts.
+    """Reads the motion of a recorded run; the first pose of each stamp is used.
 
     Args:
-        topic: topic of mixtures over poses; None: smoothed mixtures, else the posterior, else
-            predictions.
-        identity: identity of the motion; None: the heaviest mode at each time.
-        track: number of the track; None: the track with the most poses.
+        topic: topic of mixtures over poses; None selects smoothed mixtures, else the posterior,
+            else predictions.
+        identity: identity of the motion; None selects the heaviest mode at each time.
+        track: number of the track; None selects the track with the most poses.
         body_model: name or file of the body model, if the name in the bag is unknown.
         camera_axes: whether to ignore a known gravity.
 
@@ -326,7 +328,7 @@ def read_tracked_motion(
 
 
 def _topic(bag: BagReader, wanted: str | None) -> str:
-    """The topic to read."""
+    """Name of the topic to read."""
     if wanted is not None:
         return bag.find_topic([POSE_MIXTURE], wanted).name
     kinds: dict[int, list[str]] = {}
@@ -359,7 +361,7 @@ def _mixtures(
 
 
 def _pose(content: PoseMixture, identity: int | None) -> TrackedPose | None:
-    """The heaviest component, or the heaviest with the identity; None if missing."""
+    """The heaviest component, or the heaviest with a given identity; None if missing."""
     assert content.identities is not None
     weights = content.weights
     if identity is not None:
@@ -388,7 +390,7 @@ def _track(
     track: int | None,
     identity: int | None,
 ) -> int:
-    """The wanted track, or else the longest."""
+    """Number of the wanted track, or else of the longest track."""
     if not motions:
         raise ValueError(f'{where}: nobody is seen in any mixture')
     if track is not None and track not in motions:
@@ -405,7 +407,7 @@ def _track(
 
 
 def _room(path: Path, topic: str, frame_id: str) -> tuple[Array, float, str]:
-    """Axes with y up: rotation, height of the camera in them, and a description."""
+    """Rotation to axes with y up, height of the camera, m (0 if unknown), and a description."""
     grounds = read_grounds(path, topic, frame_id).values()
     if not grounds:
         told = f'in the axes of {frame_id}, turned to y up: its gravity is not known'
@@ -427,7 +429,7 @@ def _room(path: Path, topic: str, frame_id: str) -> tuple[Array, float, str]:
 
 
 def _notes(steps: Sequence[TrackedPose], end: int) -> list[str]:
-    """Notes for the user on a motion; the last message of its topic is at `end`, ns."""
+    """Notes for the user about a motion; `end` is the last stamp on its topic, ns."""
     notes = []
     others = np.array([a.identity != b.identity for a, b in pairwise(steps)], dtype=bool)
     if others.any():
@@ -440,7 +442,7 @@ def _notes(steps: Sequence[TrackedPose], end: int) -> list[str]:
     gaps = np.diff([step.stamp_ns for step in steps]) / SECOND_NS
     long = gaps[gaps > _GAP * np.median(gaps)] if len(gaps) else gaps
     if len(long):
-        notes.append(f'gaps: {len(long)}, the longest of {long.max():.2f} s; skeletons move on')
+        notes.append(f'gaps: {len(long)}, the longest {long.max():.2f} s; skeletons move on')
     if steps[-1].stamp_ns < end:
         notes.append(
             f'it ends {(end - steps[-1].stamp_ns) / SECOND_NS:.2f} s before the topic does'
@@ -450,6 +452,7 @@ def _notes(steps: Sequence[TrackedPose], end: int) -> list[str]:
     change = max((abs(a - b) for a, b in pairs), default=0.0)
     if change > 5e-4:
         notes.append(
-            f'lengths of segments change by up to {1e3 * change:.0f} mm: skeletons have the last'
+            f'lengths of segments change by up to {1e3 * change:.0f} mm: skeletons have the last '
+            'ones'
         )
     return notes

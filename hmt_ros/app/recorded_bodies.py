@@ -1,7 +1,7 @@
 """The bodies of the mixtures in a bag, and the ground.
 
-A mixture with segment lengths defines its own body. A mixture of another publisher may have none;
-its body is that on the Body topic of its namespace, or on the only Body topic of the bag.
+A mixture with segment lengths defines its own body. A mixture of another publisher may lack them;
+its body is then from the Body topic in its namespace, or from the only Body topic of the bag.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class RecordedBodies:
     """The bodies of the mixtures in a bag.
 
     Args:
-        model: name or file of the body model, if the name in the bag is unknown; None: the name in
-            the bag.
+        model: name or file of the body model, if the name in the bag is unknown; None uses the name
+            in the bag.
     """
 
     def __init__(self, model: str | None) -> None:
@@ -44,13 +44,13 @@ class RecordedBodies:
     def messages(
         self, bag: BagReader, topics: Iterable[str], progress: Callable[[int], object]
     ) -> Iterator[BagMessage]:
-        """Yields the messages on topics of mixtures, and learns the bodies in between.
+        """Yields the messages on mixture topics, and stores the bodies from Body messages.
 
         Args:
             progress: called with the number of messages that were read.
 
         Raises:
-            ValueError: an invalid message of a body, or the bag is damaged.
+            ValueError: an invalid Body message, or the bag is damaged.
         """
         bodies = [x.name for x in bag.topics_of(BODY)]
         for stored in bag.messages([*bodies, *topics]):
@@ -61,7 +61,7 @@ class RecordedBodies:
                 yield stored
 
     def _learn(self, stored: BagMessage) -> None:
-        """Learns the body in a message; it stays unknown if its model is unknown."""
+        """Stores the body from a Body message, unless its model is unknown."""
         message = stored.message
         try:
             body = resized(self._model_of(str(message.name)), lengths_of(message, 'body'))
@@ -91,7 +91,7 @@ class RecordedBodies:
         return self._newest[topic][1]
 
     def _model_of(self, name: str) -> Body:
-        """The chosen body, or the shipped body with a name; names in bags are never file names."""
+        """The model of the user, or else the shipped model; bags never name files."""
         return named_body(name) if self._model is None else load_body(self._model)
 
 

@@ -3,9 +3,9 @@
 track-video walk.mp4
 track-video street.mp4 --people 3
 
-Missing arguments are replaced: an installed detector finds the keypoints; the field of view is that
-in the metadata of the video, or else of common cameras, with an error that is in all depths; lines
-of the scene give gravity; a folder of images gets the rate of a usual video.
+Missing arguments get defaults: an installed detector finds the keypoints; the field of view is from
+the metadata of the video, or else that of common cameras, and its uncertainty is included in all
+depths; lines in the scene give gravity; a folder of images gets the frame rate of a usual video.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ DIR gets
   tracked/            the bag that replay writes, see replay --help
   report/report.html  the page that report writes, for a browser
 
-Without --keypoints the surest detector that install-detector has installed finds them: MediaPipe
-Pose, with MoveNet if it is there. Without --fov or --camera the field of view is taken from the
-metadata of the video, or assumed; the error that this may make is in all published depths. Without
---level or --gravity lines of the scene show the tilt of the camera where they can; an unknown tilt
-is taken for a lean of the person. With --people MediaPipe Pose finds so many people, and the page
-shows each on a topic of their own.
+Without --keypoints the best installed detector finds them (see install-detector): MediaPipe Pose,
+with MoveNet if installed. Without --fov or --camera the field of view is taken from the metadata of
+the video, or assumed; its uncertainty is included in all published depths. Without --level or
+--gravity the tilt of the camera is estimated from straight lines in the scene where possible; an
+unknown tilt appears as a lean of the person. With --people MediaPipe Pose finds up to N people, and
+the page shows each on a separate topic.
 
 The track starts from the keypoints, or without any from a prediction. --subject names a subject
 file instead, and --stature writes one from the keypoints of an image.
@@ -73,7 +73,7 @@ def _parser() -> CommandParser:
     )
     add_video_arguments(parser, camera_required=False)
     parser.add_argument(
-        '--no-detector', action='store_true', help='find no keypoints where none are given'
+        '--no-detector', action='store_true', help='do not run a detector if --keypoints is missing'
     )
     what = 'folder for the bags and the report (default: the name of SOURCE and _tracked)'
     parser.add_output('DIR', 'result', what, required=False)
@@ -113,7 +113,7 @@ def _track(arguments: argparse.Namespace) -> int:
     several = arguments.people is not None
     for option in ('subject', 'stature'):
         if several and getattr(arguments, option) is not None:
-            raise ValueError(f'--{option} is of one person, and does not go with --people')
+            raise ValueError(f'--{option} is for one person, and does not go with --people')
     given = several or arguments.keypoints is not None or arguments.detector is not None
     if not (given or arguments.no_detector):
         arguments.detector = surest_detector()
@@ -133,7 +133,7 @@ def _track(arguments: argparse.Namespace) -> int:
     settings, notes = _assumed(arguments)
     if not (with_keypoints or arguments.masks or arguments.subject or arguments.background):
         notes.append(
-            'neither keypoints nor the empty scene are known: the person may not be found; run '
+            'neither keypoints nor the empty scene are given: the person may not be found; run '
             '"python -m hmt_ros install-detector", or give --keypoints or --background'
         )
     for note in notes:
@@ -178,13 +178,16 @@ def _track(arguments: argparse.Namespace) -> int:
 
 
 def _assumed(arguments: argparse.Namespace) -> tuple[list[str], list[str]]:
-    """Completes the arguments; returns settings of the tracker, and notes on assumptions."""
+    """Completes the arguments; returns tracker settings, and notes about the assumptions."""
     source, settings, notes = arguments.source, [], []
     if source.is_dir() and any(source.glob('*.mcap')):
         raise ValueError(f'{source} is a bag: replay {source} tracks the person in it')
     if source.is_dir() and arguments.fps is None:
         arguments.fps = USUAL_RATE
-        notes.append(f'{source} is a folder: {USUAL_RATE:g} images a second, unless --fps says so')
+        notes.append(
+            f'{source} is a folder: {USUAL_RATE:g} images per second are assumed; --fps sets '
+            'another rate'
+        )
     if (arguments.camera, arguments.fov, arguments.vertical_fov) == (None, None, None):
         first = next(iter(open_source(source, arguments.fps).frames(Selection())), None)
         told = None if source.is_dir() else told_fov(source)
@@ -195,13 +198,13 @@ def _assumed(arguments: argparse.Namespace) -> tuple[list[str], list[str]]:
         notes.append(
             f'the field of view is {"assumed to be" if told is None else "by the metadata"} '
             f'{fov:.0f} degrees along the longer side; focal length and distances may err by '
-            f'{sigma:.0%} (one standard deviation, which is in the results): --fov or --camera '
-            'if you know better'
+            f'{sigma:.0%} (one standard deviation, included in the results): give --fov or '
+            '--camera if known'
         )
     return settings, notes
 
 
 def _of_gravity(arguments: argparse.Namespace) -> list[str]:
-    """The setting of the tracker for the direction of gravity, if it is given."""
+    """Tracker settings with the direction of gravity; empty if it is not given."""
     gravity = gravity_of(arguments)
     return [] if gravity is None else [f'gravity={gravity}']

@@ -19,7 +19,7 @@ from msg_tools.messages.pose_mixtures import POSE_MIXTURE, MixtureKind, pose_mix
 
 FIELDS = ('stamps', 'joint_names', 'joints')
 _LARGEST = 2**28  # maximum size of the arrays, bytes
-_RECORDS = 4  # number of records that a frame counts as
+_RECORDS = 4  # cost of a frame in the budget, records
 _FLOOR = ('gravity', 'camera_height')
 
 
@@ -27,7 +27,7 @@ def read_truth(path: Path) -> Truth:
     """Reads the truth from a file of arrays (.npz) or from a bag.
 
     The file has `stamps` (T,) ns, `joint_names` (J,) and `joints` (T, J, 3) m in the camera optical
-    frame, all NaN if nobody is in view. It may have the true floor: `gravity` (T, 3) and
+    frame, all NaN if nobody is in view. It can also have the floor: `gravity` (T, 3) and
     `camera_height` (T,) m, and with them `contact` (T, 2) of the left and right foot, and the pose
     of a moving camera in the world: `camera_position` (T, 3) m and `camera_quaternion` (T, 4)
     x y z w.
@@ -47,10 +47,10 @@ def read_truth(path: Path) -> Truth:
 
 
 def recorded_truth(path: Path) -> Truth | None:
-    """The ground truth in a bag; None if it has none.
+    """The ground truth in a bag; None if missing.
 
     Raises:
-        ValueError: there are several, or a message is invalid.
+        ValueError: the bag has several ground truths, or a message is invalid.
     """
     with BagReader(path) as bag:
         found = [x.name for x in bag.topics_of(POSE_MIXTURE) if is_truth(bag, x.name)]
@@ -101,7 +101,7 @@ def _ground(path: Path, content: Mapping[str, Array], stamps: Array) -> dict[int
         lengths = np.linalg.norm(known['gravity'], axis=1)
     if not ((lengths > 0) & np.isfinite(lengths) & np.isfinite(known['camera_height'])).all():
         raise ValueError(f'{path}: gravity or camera_height is zero or not finite somewhere')
-    # Without its pose the camera is at rest.
+    # A camera whose pose is not given is at rest.
     moves = {'camera_position', 'camera_quaternion'} <= known.keys()
     return {
         int(stamp): TrueGround(

@@ -2,8 +2,8 @@
 
     p(a) = w_0 N(a; m_0, S_0) + sum_k w_k/2 [N(a; m_k, S_k) + N(Ra; m_k, S_k)]
 
-a are the angles of a pose, Ra their mirror image, left for right. Component 0 is broad: it bounds
-the energy of a pose that is unlike the training data.
+a are the angles of a pose, Ra their left-right mirror image. Component 0 is broad: it bounds the
+energy of poses that are unlike the training data.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from hmt_ros.inference.mixture import GaussianMixture
 
 KIND = 'pose_prior'
 MOST_COMPONENTS = 1000
-# Maximum number of steps of the ascent to the highest density, and step at which it ends, rad.
+# Maximum number of steps of the ascent to the highest density; step size at which it ends, rad.
 CLIMB, ARRIVED = 1000, 1e-7
-SAME = 1e-4  # maximum difference of two rest rotations due to single precision
+SAME = 1e-4  # maximum difference between equal rest rotations in single precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,14 +45,14 @@ class AngleMixture:
 
     Attributes:
         skeleton: skeleton of the angles; its lengths are not used.
-        dofs: names of the n degrees of freedom that it covers.
-        components: broad component first, then K components; the weight of each of these is that
-            of the component and its mirror image together.
-        card: data, method and licence; JSON must be able to hold it.
+        dofs: names of the n degrees of freedom that the mixture covers.
+        components: broad component first, then K components, each with the total weight of the
+            component and its mirror image.
+        card: training data, method and licence, serialisable as JSON.
 
     Raises:
-        ValueError: names that the body does not have or that lack their mirror image, or
-            components that are none; one line.
+        ValueError: the body lacks a name, the mirror image of a name is missing, or the components
+            are invalid; one line.
     """
 
     skeleton: Skeleton
@@ -84,7 +84,7 @@ class AngleMixture:
 
     @cached_property
     def whole(self) -> GaussianMixture:
-        """The mixture with the mirror images as components of their own, weights that sum to 1."""
+        """The mixture with mirror images as separate components; the weights sum to 1."""
         order, signs = self._mirror_order
         own = self.components
         halves = own.weights[1:] / 2.0
@@ -116,7 +116,7 @@ class AngleMixture:
             log = whole.component_log_densities(points) + elementary.log(whole.weights)
             shares = elementary.exp(log - log.max(axis=1, keepdims=True))
             shares /= shares.sum(1, keepdims=True)
-            # The minimum of the quadratic that touches -log p here and lies above it elsewhere.
+            # Minimise the quadratic that touches -log p at the point and bounds it from above.
             curvature = product(shares, precisions).reshape(-1, n, n)
             moved = solve(curvature, product(shares, pulled)[..., None])[..., 0]
             step, points = float(np.abs(moved - points).max()), moved
@@ -145,7 +145,7 @@ class AngleMixture:
 
         Raises:
             ValueError, LookupError, TypeError: arrays or parameters are missing or wrong, or the
-                skeleton is another one.
+                skeleton differs.
         """
         parameters, card = parameters_of(arrays), parameters_of(arrays, 'card')
         same = np.allclose(arrays['mounts'], skeleton.mounts, atol=SAME)
@@ -160,7 +160,7 @@ class AngleMixture:
         return cls(skeleton, dofs, components, card)
 
     def answer(self, given: Array) -> GaussianMixture:
-        """The mixture."""
+        """The mixture, for any input."""
         return self.whole
 
     @cached_property
@@ -199,10 +199,10 @@ def _same_angles(first: Skeleton, second: Skeleton) -> bool:
 
 
 def read_pose_prior(path: str | Path, body: Body) -> AngleMixture:
-    """The learned prior in a file.
+    """Read a learned prior from a file.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged, none of this format, or of another body; one line.
+        ValueError: the file is damaged, has another format, or is for another body; one line.
     """
     return read_model(path, KIND, partial(AngleMixture.from_arrays, skeleton=body.skeleton))

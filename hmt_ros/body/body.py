@@ -1,12 +1,11 @@
 """The body: its skeleton, its flesh, and the prior of its poses.
 
-Symmetries are pairs of poses that look alike to a camera:
+A symmetry maps a pose to another pose with nearly the same image:
 
     p(dt) = (1 - exp(-2 q dt)) / 2        q: rate of the symmetry, 1/s                          (1)
 
-A symmetry maps a pose to another one with nearly the same image. p is the probability that after dt
-seconds the mapped pose is taken for the pose: that of a two-state chain that switches q times a
-second. The model file has the table of rates; `MAPS` defines the maps.
+p is the probability that a track has switched to the mapped pose after dt seconds, in a two-state
+chain with rate q. The model file has the table of rates; `MAPS` lists the maps.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import product
 from hmt_ros.inference.logistic import probability_of
 
-# Columns of the growth, the difference of a part of the flesh from the model's: log factors on the
-# x and y radii, additional extent beyond the start and the end of its segment, m, and shift along
-# the y axis, m.
+# Columns of the growth, which is the difference of a part of the flesh from the model file: log
+# factors on the x and y radii, additional extent beyond the start and the end of its segment, m,
+# and shift along the y axis, m.
 GROWTH = ('width', 'depth', 'start', 'end', 'shift')
 # Angles of a root that can be levelled.
 ROOT_ANGLES = ('root_z', 'root_y', 'root_x')
@@ -46,9 +45,9 @@ class PartShape:
     Attributes:
         segment: index of the segment that carries the part.
         length: index of the length that the part spans; None for a part of fixed proportions.
-        centre: centre of the part in its segment's frame, m; with a length, its shift from the
-            middle of that length.
-        radii: semi-axes (x, y) with a length, else (x, y, z), m.
+        centre: centre of the part in its segment's frame, m; if the part spans a length, its shift
+            from the middle of that length.
+        radii: semi-axes (x, y) if the part spans a length, else (x, y, z), m.
         exponents, taper, bend: shape parameters, as in `Superquadric`.
         extend: distances by which the part exceeds the start and the end of the length, m.
         rings: number of rings at which the contour of the part is sampled.
@@ -93,7 +92,7 @@ class PartShape:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A person: the meaning of a pose vector, and the shape of the flesh.
+    """Model of a person: the meaning of a pose vector, and the shape of the flesh.
 
     Poses have shape (N, d): root translation in the camera optical frame (m), root rotation, joint
     angles (rad). Made by `load_body`.
@@ -101,17 +100,18 @@ class Body:
     Attributes:
         skeleton: segments, degrees of freedom, joints and lengths.
         shapes: parts of the flesh; empty for a bare skeleton.
-        prior_mean, prior_sigma: (d,) Gaussian prior of each degree of freedom; sigma is inf where
-            there is none.
-        rates: (d,) variance that each degree of freedom gains per second by itself, m^2 or rad^2.
-        length_covariance: (L, L) of the lengths over people, or of the estimate for this person,
-            m^2.
-        stature_lengths, stature_extra: the stature is the sum of these lengths plus the extra (m,
-            at the default lengths; it scales with them).
+        prior_mean, prior_sigma: (d,) Gaussian prior of each degree of freedom; a sigma of inf
+            means no prior.
+        rates: (d,) variance that a random walk of each degree of freedom gains per second, m^2 or
+            rad^2.
+        length_covariance: (L, L) covariance of the lengths over people, or of the estimate for this
+            person, m^2.
+        stature_lengths, stature_extra: the stature is the sum of these lengths plus the extra, m,
+            which scales with the lengths.
         default_lengths: (L,) lengths of the model file, m.
         symmetries: symmetries by map; see `Symmetry`.
-        joint_errors: (J,) standard deviation of a coordinate of each joint, relative to the pelvis,
-            that all poses share, because people's joints are not exactly the model's, m.
+        joint_errors: (J,) standard deviation of the constant error of each joint's coordinates
+            relative to the pelvis, m, because people's joints differ from the model's.
         growth: (B, 5) difference of each part from the model's; see `GROWTH`.
         level: (3, 3) rotation from the reference axes of the root's angles to the axes of the
             camera; see `levelled`.
@@ -250,7 +250,7 @@ class Body:
 
     @cached_property
     def flesh(self) -> Flesh:
-        """The flesh at the present lengths and growth."""
+        """The flesh with the current lengths and growth."""
         parts = tuple(
             shape.part(self.skeleton.lengths, self.scale_of(shape), growth)
             for shape, growth in zip(self.shapes, self.growth, strict=True)
@@ -305,7 +305,7 @@ class Body:
     def with_beliefs(
         self, *, prior_sigma: Array | None = None, joint_errors: Array | None = None
     ) -> Body:
-        """Return the same body with another prior or other errors; the flesh is unchanged."""
+        """Return the same body with another prior or other joint errors; the flesh is kept."""
         result = replace(
             self,
             prior_sigma=self.prior_sigma if prior_sigma is None else prior_sigma,
@@ -315,14 +315,14 @@ class Body:
         return result
 
     def levelled(self, level: Array) -> Body:
-        """Return the same body with the angles of the root measured from other axes.
+        """Return the same body with the root angles measured in the axes of an upright camera.
 
-        An upright person is then far from the poles and the limits of these angles, whatever the
+        The root angles of an upright person are then far from their poles and limits at every
         orientation of the camera. Translations stay in the axes of the camera. A body whose root
-        has other angles keeps its level.
+        has other angles is returned unchanged.
 
         Args:
-            level: (3, 3) rotation from those axes, which are of an upright camera, to the camera's.
+            level: (3, 3) rotation from the axes of an upright camera to the camera's axes.
         """
         if np.array_equal(level, self.level) or not {*ROOT_ANGLES} <= {*self.dof_names}:
             return self
@@ -361,7 +361,7 @@ class Symmetry:
             raise ValueError(f'the rate of a symmetry must be positive, saw {self.rate} 1/s')
 
     def probability(self, dt: float) -> float:
-        """p(dt) that the mapped pose is the one dt seconds later, (1)."""
+        """Probability p(dt) of the mapped pose after dt seconds, equation (1)."""
         return float(-0.5 * elementary.expm1(-2.0 * self.rate * dt))
 
     def price(self, dt: float) -> float:
@@ -369,7 +369,7 @@ class Symmetry:
         return -float(elementary.log(self.probability(dt))) if dt > 0.0 else math.inf
 
     def after(self, log_odds: float, dt: float) -> float:
-        """Log odds of the mapped pose dt seconds later."""
+        """Log odds of the mapped pose after dt seconds, from present log odds."""
         p = float(probability_of(log_odds))
         p += self.probability(dt) * (1.0 - 2.0 * p)
         return float(elementary.log(p) - elementary.log1p(-p))

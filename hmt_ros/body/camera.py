@@ -3,9 +3,10 @@
 Frame: camera optical frame of REP 103, x right, y down, z forward, m. Pixels: column u, row v, the
 centre of the first pixel at (0, 0).
 
-A `Viewpoint` is the pose of a still camera above a level floor. The world of rendered motions has
-its origin on the floor, straight in front of the camera. A person in the rest pose there faces the
-camera: x to the person's right (left in the image), y towards the camera, z up.
+`hmt_learning.motion.viewpoint.Viewpoint` is the pose of a static camera above a level floor. The
+world frame of rendered motions has its origin on the floor, straight in front of the camera. There
+a person in the rest pose faces the camera: x to the person's right (left in the image), y towards
+the camera, z up.
 """
 
 from __future__ import annotations
@@ -31,19 +32,19 @@ AXES.setflags(write=False)
 # Direction against gravity in the frame of an upright camera.
 IMAGE_UP = np.array([0.0, -1.0, 0.0])
 IMAGE_UP.setflags(write=False)
-# Distances between which 95 % of people are seen, m, by a lens of this usual angle of view, rad.
+# Range of distances with 95 % of visible people, m, for a lens with the usual angle of view, rad.
 NEAREST_PERSON, FARTHEST_PERSON, USUAL_LENS = 0.4, 15.0, np.radians(60.0)
 
-NEAR = 0.01  # minimum depth of a point with a pixel, m
-# Minimum component of the vertical across the optical axis that determines the roll.
+NEAR = 0.01  # minimum depth of a point that has a pixel, m
+# Minimum component of the unit vertical across the optical axis for which the roll is defined.
 STEEP = 0.1
-# Tangents of the angles where a distortion is checked, and maximum growth of the magnification
-# farther out; calibrations of real lenses reach 2.5, at the corners of wide images.
+# Tangents of the angles at which a distortion is checked; maximum growth of the magnification
+# outwards. Calibrations of real lenses reach 2.5, at the corners of wide images.
 _TURNS = 0.499 * np.pi * np.linspace(0.0, 1.0, 300) ** 2
 CHECKED = elementary.sin(_TURNS) / elementary.cos(_TURNS)
 LARGEST_RISE = 4.0
-# Fraction of the way from the principal point to a corner where a distortion must not fold. It
-# covers the ends of the longer side; polynomials of real calibrations may fold farther out.
+# Fraction of the way from the principal point to a corner up to which a distortion must not fold.
+# It covers the ends of the longer side; polynomials of real calibrations may fold farther out.
 LEAST_UNFOLDED = 0.8
 
 # Models of distortion in compiled code.
@@ -109,7 +110,7 @@ class Camera:
             raise ValueError(f'focal lengths must be positive, saw {self.fx} and {self.fy}')
         if self.width < 1 or self.height < 1:
             raise ValueError(f'image size must be positive, saw {self.width} x {self.height}')
-        # Only the fisheye lens bends rays with all of its coefficients at zero.
+        # With all coefficients at zero, only the fisheye model bends rays.
         bends = any(coefficients) or self.distortion_model == 'equidistant'
         if bends and not coefficients:
             coefficients = (0.0,) * max(counts)
@@ -126,7 +127,7 @@ class Camera:
         """Return the same camera with images of another size, px.
 
         Raises:
-            ValueError: the aspect ratio differs, beyond rounding to whole pixels.
+            ValueError: the aspect ratio differs by more than rounding to whole pixels.
         """
         if abs(width * self.height - height * self.width) >= max(self.width, self.height):
             raise ValueError(
@@ -197,8 +198,8 @@ class Camera:
     def rays(self, pixels: ArrayLike) -> Array:
         """Unit rays (..., 3) through pixels (..., 2).
 
-        Newton's method inverts the distortion. Where the model has no ray through a pixel, the
-        result is the ray after the last iteration.
+        Newton's method inverts the distortion. If the model has no ray through a pixel, the result
+        is the ray after the last iteration.
         """
         uv = np.ascontiguousarray(pixels, dtype=np.float64)
         result = np.empty((*uv.shape[:-1], 3))
@@ -251,16 +252,16 @@ class Camera:
 
 @lru_cache(maxsize=64)
 def unfolded_share(camera: Camera) -> float:
-    """Return the fraction of the way to the corners where the distortion does not fold, 0 to 1.
+    """Return the fraction of the way to the corners without a fold of the distortion, 0 to 1.
 
     From the principal point to each corner the distorted radius must increase with the ideal one,
-    and its slope must stay below `LARGEST_RISE` times the least slope farther in.
+    and its slope must stay below `LARGEST_RISE` times the smallest slope nearer the centre.
     """
     x, y = (np.array([-0.5, n - 0.5]) for n in (camera.width, camera.height))
     a, b = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
     corners = elementary.hypot(a, b).reshape(-1, 1).clip(min=1e-9)
     ideal = CHECKED * np.stack([a, b]).reshape(2, -1, 1) / corners
-    with np.errstate(all='ignore'):  # a rational model has poles, which lie outside
+    with np.errstate(all='ignore'):  # a rational model has poles outside the image
         radius = elementary.hypot(*camera.distort(*ideal)[0])
         slope = np.diff(radius) / np.diff(CHECKED)
     # A fold outside the image may map back into it, but affects no pixel.
@@ -289,9 +290,9 @@ def roll(ups: ArrayLike) -> Array:
 
 
 def shortest_turn(start: Array, end: Array) -> Array:
-    """Return the rotation (3, 3) by the least angle from one unit vector to another.
+    """Return the rotation (3, 3) with the smallest angle from one unit vector to another.
 
-    For opposite vectors, where the shortest rotation is ambiguous, it is half a turn about the
+    For opposite vectors this rotation is ambiguous. The result is then half a turn about the
     optical axis, as for a camera that is mounted upside down.
     """
     cosine = float(product(start, end))

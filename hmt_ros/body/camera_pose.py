@@ -1,4 +1,4 @@
-"""Pose of a camera in a frame that stands still: p_fixed = C p + c."""
+"""Pose of a camera in a static frame: p_fixed = C p + c."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from hmt_ros.body.rotations import rotation_vectors, rotations_of
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import determinant, length, product
 
-# Largest difference of an entry of R R' from the identity for R to be a rotation.
+# Maximum deviation of an entry of R R' from the identity for a valid rotation R.
 NOT_ORTHOGONAL = 1e-3
 # Default distance of people and of the scene, m.
 USUAL_DISTANCE = 3.0
 
 
 class CameraPose(NamedTuple):
-    """Pose of the camera optical frame in a frame that stands still: p_fixed = C p + c.
+    """Pose of the camera optical frame in a static frame: p_fixed = C p + c.
 
     Attributes:
         rotation: C (3, 3).
@@ -62,7 +62,7 @@ class CameraPose(NamedTuple):
         return float(max(camera.fx, camera.fy) * (angle + apart / USUAL_DISTANCE))
 
     def towards(self, other: CameraPose, share: float) -> CameraPose:
-        """Interpolate to another pose by constant motion; share 0: this pose, 1: the other."""
+        """Interpolate to another pose at constant speed; share 0: this pose, 1: the other."""
         turn = rotation_vectors(product(self.rotation.T, other.rotation))
         rotation = product(self.rotation, rotations_of(share * turn))
         return CameraPose(rotation, self.position + share * (other.position - self.position))

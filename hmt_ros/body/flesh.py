@@ -15,8 +15,8 @@ condition normal . point = 0 reads
 
     g(w) = 1 + U_x C'(w) + U_y S'(w) - u_z (k_x cos^2 w + k_y sin^2 w) = 0,
 
-with U = (u - u_z lean) / radius, k the slopes, C' and S' the signed powers 2 - e2. With one slope
-and e2 = 1 it has a closed form (`image.surface` solves it).
+with U = (u - u_z lean) / radius, k the slopes, C' and S' the signed powers 2 - e2. If both slopes
+are equal and e2 = 1, the solution has a closed form (`image.surface`).
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from hmt_ros.inference.arrays import Array, Index
 
 @dataclass(frozen=True)
 class Superquadric:
-    """One part of the flesh; m, in the frame of its segment.
+    """One part of the flesh, in the frame of its segment; lengths in m.
 
     Attributes:
         segment: index of the segment that carries the part.
         centre: centre of the part.
         radii: semi-axes along x, y and z.
-        exponents: shape along the axis and around it; 1 is elliptic, towards 0 boxy.
+        exponents: shape along the axis and around it; 1 is elliptic, near 0 is boxy.
         taper: relative change of the x and y radii from the middle to the end (s = 1).
         bend: shift in x and y of the middle relative to both ends, m.
     """
@@ -90,9 +90,9 @@ class Superquadrics(NamedTuple):
 
 
 def surfaces(parts: Superquadrics, s: Array, w: Array) -> tuple[Array, Array]:
-    """Return points and outward normals (P, R + 2, 3) at R heights and angles, and the tips.
+    """Return points and outward normals (P, R + 2, 3) at R heights and angles, and at both tips.
 
-    s, w: (R,), with heights in (-1, 1).
+    s: (R,) heights in (-1, 1); w: (R,) angles, rad.
     """
     points, normals = np.empty((2, len(parts.radii), len(s) + 2, 3))
     fill_surface(parts, s, elementary.cos(w), elementary.sin(w), points, normals)
@@ -119,7 +119,7 @@ class Flesh:
 
     @cached_property
     def table(self) -> Superquadrics:
-        """The parts, for the core."""
+        """The parts as arrays, for the core."""
         names, sizes = ('centre', 'radii', 'exponents', 'taper', 'bend'), (3, 3, 2, 2, 2)
         return Superquadrics(
             *(
@@ -146,7 +146,7 @@ class Flesh:
         """Triangulate all parts: `stacks` rings of `slices` points and two tips per part.
 
         Raises:
-            ValueError: fewer than 2 stacks, or 3 slices.
+            ValueError: there are fewer than 2 stacks or 3 slices.
         """
         return _mesh(self, stacks, slices)
 

@@ -5,11 +5,11 @@
     motion     log(1 - q + q N(m; 0, S_rest) / N(m; 0, S_free)),  q = c_(t-1) exp(-leave dt) / P
     posterior  logit c_t = logit P + a(dt) (height + motion)
 
-c is the probability that the point rests, m its motion since the image before and h its height
-above the floor. A resting point has rested since that image with the probability q; otherwise it
-has come to rest since. Along the line of sight an image shows little of m, so there both deviations
-are wider and nearer to each other. Errors of a pose last, so an image counts with its share a(dt)
-in time (`hmt_ros.inference.error_model`), and the errors of images that are close differ little.
+c is the probability that the point rests, m its motion since the previous image and h its height
+above the floor. With probability q, a resting point was at rest before; otherwise it has just come
+to rest. Images show little motion along the line of sight, so both deviations are wider there and
+differ less. Errors of a pose are correlated in time: evidence is weighted by the share a(dt) of an
+image in time (`hmt_ros.inference.error_model`), and errors of close images differ little.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from hmt_ros.inference.linear_algebra import product
 from hmt_ros.inference.logistic import log_odds, probability_of
 from hmt_ros.inference.markov_chain import MarkovChain
 
-# Rates at which a resting foot leaves the floor and a moving one comes to rest in walking, 1/s.
+# Rates at which a resting foot leaves the floor and a moving foot comes to rest in walking, 1/s.
 LEAVES, ENTERS = 1.5, 2.5
 CONTACT = MarkovChain.of_two(ENTERS, LEAVES)
 # Standard deviations of the apparent motion of a resting point between distant times, across and
@@ -32,28 +32,28 @@ CONTACT = MarkovChain.of_two(ENTERS, LEAVES)
 REST_ACROSS, REST_ALONG = 0.013, 0.033
 # Standard deviation of each velocity component of a moving foot, m/s.
 FREE_SPEED = 1.0
-# Deviation of the height of a resting point from that of the floor, besides that of the floor
-# itself; height up to which a free foot is lifted, m.
+# Standard deviation of the height of a resting point above the floor, in addition to the deviation
+# of the floor itself; maximum height of a free foot, m.
 REST_HIGH, LIFT = 0.04, 0.25
 
 
 def first_contacts(plane: FloorPlane, points: Array) -> Array:
-    """Return the initial probabilities (K, P) that points (K, P, 3) of soles rest."""
+    """Contact probabilities (K, P) of new sole points (K, P, 3), from the stationary prior."""
     return probability_of(log_odds(CONTACT.usual[1]) + _height_evidence(plane, points))
 
 
 def contacts(
     plane: FloorPlane, points: Array, rested: Array, before: Array, dt: float, *, still: bool
 ) -> Array:
-    """Probabilities (K, P) that points of soles rest, after an image.
+    """Contact probabilities (K, P) of sole points after an image.
 
     Args:
         plane: gravity and floor.
-        points: (K, P, 3) m.
-        rested: (K, P) probabilities in the image before.
-        before: (K, P, 3) the points there, in the same camera frame, m.
-        dt: time since then, s.
-        still: whether the motion of the camera is known; if not, that of a foot is no evidence.
+        points: (K, P, 3) sole points, m.
+        rested: (K, P) contact probabilities after the previous image.
+        before: (K, P, 3) sole points in the previous image, in the same camera frame, m.
+        dt: time since the previous image, s.
+        still: whether the motion of the camera is known; if not, foot motion is no evidence.
     """
     prior = CONTACT.closed(rested, dt)
     evidence = _height_evidence(plane, points)
@@ -66,7 +66,7 @@ def contacts(
 
 
 def _height_evidence(plane: FloorPlane, points: Array) -> Array:
-    """Log odds (K, P) of rest by the heights of points (K, P, 3)."""
+    """Return log odds (K, P) of rest from the heights of points (K, P, 3)."""
     if plane.height is None:
         return np.zeros(points.shape[:2])
     sigma = elementary.hypot(REST_HIGH, plane.height_sigma)

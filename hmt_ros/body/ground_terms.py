@@ -5,16 +5,16 @@
 
 `lean_s` is the direction of gravity in the frame of the pelvis or trunk, minus that of an upright
 person; h_p is the height of a point of the sole above the floor. The tails are heavy because people
-bend and lie. A floor that is only known from the feet of the track costs nothing: an overestimate
-of its height would push the next feet up as well.
+bend and lie down. A floor that is only known from the feet of the track is not used: if its height
+is overestimated, it would push the next feet up as well.
 
 The soles are the contact points between the flesh of the feet and a floor. The points of a foot are
 the lowest points of its flesh when the flat foot is pitched by `PITCH` up (heel) or down (toe).
 They move with the flesh when the shape changes.
 
 Mass fractions of the segments, and distances of their centres from the upper ends relative to the
-lengths, are those of [Winter, Biomechanics and Motor Control of Human Movement, 4th ed. 2009, table
-4.1, after Dempster]. Its trunk of 0.497 splits into 0.142 pelvis and 0.355 thorax and abdomen.
+lengths, are from [Winter, Biomechanics and Motor Control of Human Movement, 4th ed. 2009, table
+4.1, after Dempster]. Its trunk of 0.497 is split into 0.142 pelvis and 0.355 thorax and abdomen.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ from hmt_ros.inference.linear_algebra import product, unit
 # the pelvis; on the clips, 8 works better for the pelvis. The heavy tails allow bending.
 TRUNK_LEAN, TRUNK_SIGMA = 0.0, (np.radians(5.0), np.radians(9.0))
 PELVIS_LEAN, PELVIS_SIGMA = np.radians(-8.0), (np.radians(8.0), np.radians(14.0))
-# The same for the shanks of hidden legs, which are upright in standing and sitting people. Visible
-# legs lean as the image shows.
+# The same for the shanks of hidden legs, which are upright in standing and sitting people. For
+# visible legs the image shows the lean.
 SHANK_LEAN, SHANK_SIGMA = np.radians(5.0), (np.radians(8.0), np.radians(20.0))
 # Standard deviation of the depth below an exact floor plane, m.
 FLOOR_SIGMA = 0.02
@@ -86,11 +86,11 @@ class FloorPlane:
 
     Attributes:
         up: (3,) unit vector against gravity, camera frame.
-        up_sigma: standard deviation of its angle, rad.
+        up_sigma: standard deviation of the angle of `up`, rad.
         height: height of the camera above the floor, m; None: unknown.
-        height_sigma: standard deviation of the floor's height where the person is, m.
+        height_sigma: standard deviation of the floor's height at the person, m.
         measured: whether the height is known independently of the person's own feet. If not, it
-            only describes where the feet were before.
+            only describes earlier positions of the feet.
     """
 
     up: Array
@@ -109,12 +109,12 @@ class Constants(NamedTuple):
         weights: (2,) weights of the upright and the floor term; 0 switches a term off.
         up: (3,) unit vector against gravity.
         height: height of the camera above the floor, m.
-        upright: (U,) segments that are upright.
-        axes: (U, 3, 3) their axes: to the side, ahead, up.
+        upright: (U,) segments with a prior of being upright.
+        axes: (U, 3, 3) axes of these segments: to the side, ahead, up.
         lean: (U, 3) standard deviations of gravity along these axes, rad.
-        soles: (P,) segments of the points of the soles.
-        local: (P, 3) their positions in the segments' frames, m.
-        per_floor: 1 / deviation of the height of the floor, 1/m.
+        soles: (P,) segments that carry the sole points.
+        local: (P, 3) positions of the sole points in the segments' frames, m.
+        per_floor: 1 / standard deviation of the height of the floor, 1/m.
         lean_tails, floor_tails: degrees of freedom of the robust costs.
     """
 
@@ -183,7 +183,7 @@ class Upright(NamedTuple):
     Attributes:
         segments: (U,).
         axes: (U, 3, 3) axes in the frame of each segment; the rows point to the side, ahead and up
-            when the person stands as usual.
+            when the person stands normally.
         sigma: (U, 3) standard deviations of the vertical along these axes, rad.
     """
 
@@ -194,10 +194,10 @@ class Upright(NamedTuple):
 
 @lru_cache(maxsize=16)
 def upright_segments(skeleton: Skeleton, hidden: tuple[int, ...] = ()) -> Upright:
-    """Return pelvis and trunk of a skeleton whose root turns about z, y and x; else no segments.
+    """Return pelvis and trunk of a skeleton whose root turns about z, y and x, else none.
 
     Args:
-        hidden: hidden segments; hidden shanks count as upright, too.
+        hidden: segments hidden from the camera; hidden shanks are included.
     """
     if not len(_root_turns(skeleton)) or 'neck' not in skeleton.joint_names:
         return Upright(np.zeros(0, dtype=np.intp), np.zeros((0, 3, 3)), np.zeros((0, 3)))
@@ -221,7 +221,7 @@ def upright_segments(skeleton: Skeleton, hidden: tuple[int, ...] = ()) -> Uprigh
 
 @lru_cache(maxsize=16)
 def _at_rest(skeleton: Skeleton) -> tuple[Array, Array, Array]:
-    """Columns (S, 3, 3), origins (S, 3) and joints (J, 3) where all angles are 0."""
+    """Columns (S, 3, 3), origins (S, 3) and joints (J, 3) at zero angles."""
     frames = forward(skeleton, np.zeros((1, skeleton.dimension)))
     (columns,), (origins,) = frames.segments
     return columns, origins, frames.joints()[..., 0]
@@ -232,7 +232,7 @@ def _axes(columns: Array, segment: int, along: Array, lean: float) -> Array:
 
     Args:
         columns: (S, 3, 3) frames at rest.
-        along: (3,) its long axis upwards, in the same frame as the columns.
+        along: (3,) upward long axis of the segment, in the same frame as the columns.
         lean: usual forward lean of the long axis in a standing person, rad.
     """
     up = unit(along)
@@ -248,7 +248,7 @@ def _across(vector: Array, axis: Array) -> Array:
 
 
 def root_lean_dofs(body: Body) -> Index:
-    """Return indices (L,) of the root rotations that have a prior on the lean in the camera."""
+    """Return indices (L,) of the root rotations with a prior on the lean in the camera frame."""
     turns = _root_turns(body.skeleton)
     return np.asarray(turns[np.isfinite(body.prior_sigma[turns])], dtype=np.intp)
 
@@ -262,7 +262,7 @@ def _root_turns(skeleton: Skeleton) -> Index:
 
 
 def without_root_lean(body: Body) -> Body:
-    """A body without the prior of the root's angles against the camera."""
+    """Return the body without its prior on root angles relative to the camera."""
     lean = root_lean_dofs(body)
     if not len(lean):
         return body
@@ -274,7 +274,7 @@ def without_root_lean(body: Body) -> Body:
 FEET = ('left', 'right')
 # Pitch of the foot that defines the lowest points of heel and toe, rad.
 PITCH = np.radians(15.0)
-# Height of the ankle above the floor over the stature, for a foot without flesh [Winter,
+# Height of the ankle above the floor relative to the stature, for a foot without flesh [Winter,
 # Biomechanics and Motor Control of Human Movement, 4th ed. 2009, figure 4.1].
 ANKLE_HEIGHT = 0.039
 
@@ -284,8 +284,8 @@ class Soles:
     """Points of the soles: heel and toe of the left foot, then of the right foot.
 
     Attributes:
-        segments: (P,) segments that carry them; empty for a body without feet.
-        local: (P, 3) in the frames of the segments, m.
+        segments: (P,) segments that carry the points; empty for a body without feet.
+        local: (P, 3) positions of the points in the frames of the segments, m.
     """
 
     segments: Index
@@ -339,7 +339,7 @@ def sole_jacobians(body: Body, poses: Array) -> Array:
 def _down_and_ahead(skeleton: Skeleton, ankle: int, toe: int, carrier: int) -> tuple[Array, Array]:
     """Unit vectors towards the sole and the toe, in the frame of the foot.
 
-    Towards the sole is the direction of the shin when all angles are 0, perpendicular to the foot.
+    The first is the direction of the shin at zero angles, made perpendicular to the foot.
     """
     columns, origins, joints = _at_rest(skeleton)
     shin = joints[ankle] - origins[skeleton.parents[carrier]]
@@ -359,7 +359,7 @@ SHARES = {
     'shin': (0.0465, 0.433),
     'foot': (0.0145, 0.5),
 }
-# Minimum mass fraction that the known segments of a body must have.
+# Minimum total mass fraction of the known segments of a body.
 LEAST_SHARE = 0.8
 
 
@@ -369,7 +369,7 @@ class Masses:
 
     Attributes:
         shares: (S,) mass fractions with sum 1; all 0 if unknown.
-        centres: (S, 3) in the frames of the segments, m.
+        centres: (S, 3) centres of mass in the frames of the segments, m.
     """
 
     shares: Array
@@ -388,7 +388,7 @@ class Masses:
 
 @lru_cache(maxsize=16)
 def masses(skeleton: Skeleton) -> Masses:
-    """Return the masses of a skeleton with segment names as in `SHARES`; else all unknown."""
+    """Return the masses of a skeleton with segment names as in `SHARES`, else unknown masses."""
     count = len(skeleton.parents)
     shares, centres = np.zeros(count), np.zeros((count, 3))
     for s, name in enumerate(skeleton.segment_names):
@@ -403,10 +403,10 @@ def masses(skeleton: Skeleton) -> Masses:
 
 
 def _end(skeleton: Skeleton, segment: int) -> Array:
-    """Return the end (3,) of a segment, m: its farthest joint, or the start of the next one."""
+    """Return the end (3,) of a segment, m: its farthest joint or the next segment's start."""
     ends = [np.zeros(3), *skeleton.joint_offsets[skeleton.joint_segments == segment]]
     children = [s for s, parent in enumerate(skeleton.parents) if parent == segment]
-    # The mean of several child segments, such as the shoulders and the neck between them.
+    # The mean over several child segments, such as both upper arms and the neck.
     if children:
         ends.append(np.mean([skeleton.offsets[s] for s in children], axis=0))
     return np.asarray(max(ends, key=lambda end: float((end * end).sum())), dtype=np.float64)

@@ -1,14 +1,14 @@
 """The space that a robot must keep out of: capsules that contain the person in all modes.
 
-Each part of the flesh is a capsule. In every mode its radius is the sum of the flesh, the error of
-the body model and the uncertainty of its place,
+Each part of the flesh is a capsule. In every mode its radius is the sum of the radius of the flesh,
+the error of the body model and the uncertainty of its position,
 
     r = r_flesh + MARGIN + q s,       q^2 the quantile `probability` of chi^2 with 3 dimensions
 
 s is the standard deviation of its ends in the second most uncertain direction. Along the most
-uncertain one, usually depth, the capsule is repeated over q times the deviation. Modes are
+uncertain direction, usually depth, the capsule is repeated over q times the deviation. Modes are
 included, heaviest first, until their weights sum to `probability`. Capsules inside others are left
-out. A lost person may have moved: all capsules grow by `reach_after` the time since then.
+out. A lost person may have moved, so all capsules grow by `reach_after` the time since the loss.
 
 Only the coverage that `benchmarks/keep_out.py` measures on clips is guaranteed. It excludes people
 whose loss the tracker has not noticed, and long objects in people's hands.
@@ -34,22 +34,22 @@ from hmt_ros.inference.mixture import GaussianMixture
 MARGIN = 0.05
 # Radius of a bone of a body without flesh, m.
 BARE = 0.07
-# Distance of neighbouring capsules over their radius.
+# Distance of neighbouring capsules relative to their radius.
 SPACING = 1.2
-# Spread over the radius below which it widens a capsule instead of adding capsules.
+# Spread relative to the radius below which a capsule is widened instead of repeated.
 LITTLE = 0.15
 # Cosines and sines of angles around an axis.
 _ANGLES = np.arange(8) * (np.pi / 4)
 _RING = np.stack([elementary.cos(_ANGLES), elementary.sin(_ANGLES)])
 # Speed, m/s, and reach, m, of a striking hand.
 STRIKING_SPEED, ARM_REACH = 7.0, 0.7
-# Speed of a runner, which a person hardly exceeds, m/s.
+# Speed of a runner, rarely exceeded by a person, m/s.
 RUNNING_SPEED = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class Capsules:
-    """N segments of lines, each with a radius; m.
+    """N capsules: line segments with radii; m.
 
     Attributes:
         starts, ends: (N, 3) ends of the axes.
@@ -105,15 +105,15 @@ def reach_after(time: float) -> float:
 
 
 def keep_out_capsules(body: Body, mixture: GaussianMixture, probability: float = 0.99) -> Capsules:
-    """Return capsules that contain the person with about a probability.
+    """Return capsules that contain the person with approximately the given probability.
 
     Args:
-        body: of the poses.
+        body: body of the poses.
         mixture: mixture over the pose (d,), the posterior of an image or a forecast.
         probability: coverage of each part of the person, and total weight of the modes; below 1.
 
     Raises:
-        ValueError: no modes, or the probability is not between 0 and 1.
+        ValueError: there are no modes, or the probability is not between 0 and 1.
     """
     if not len(mixture):
         raise ValueError('no modes; wanted those of a person who is tracked')
@@ -134,7 +134,7 @@ def keep_out_capsules(body: Body, mixture: GaussianMixture, probability: float =
     places = ends.reshape(len(some), -1, 2, 3)
     deep = directions[..., 2].reshape(places.shape)
     across, along = (sigmas[..., i].reshape(places.shape[:3]).max(2) for i in (1, 2))
-    # Both ends are shifted in the same direction.
+    # Shift both ends in the same direction.
     same = np.where((deep[:, :, 0] * deep[:, :, 1]).sum(2) < 0.0, -1.0, 1.0)
     deep[:, :, 1] *= same[:, :, None]
     radius = radii + MARGIN + wide * across
@@ -158,7 +158,7 @@ def _parts(body: Body) -> tuple[Index, Array, Array]:
     """Capsules of a body in the frames of its segments.
 
     Returns:
-        Segments (2 B,) and places (2 B, 3) of their ends, one after the other, and radii (B,), m.
+        Segments (2 B,) and positions (2 B, 3) of the ends, in pairs, and radii (B,), m.
     """
     segments, ends, radii = [], [], []
     for part in body.flesh.parts:

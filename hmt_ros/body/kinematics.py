@@ -1,6 +1,6 @@
 """Forward kinematics, exact Jacobians, and energies over points of the body, for N poses at once.
 
-`core/residuals.h` describes how derivatives over points become those over poses.
+`core/residuals.h` explains how derivatives by points become derivatives by poses.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Frames:
 
         Args:
             segments: (P,) the segment of each point.
-            local: (P, 3), or (P, 3, N) where the points differ from pose to pose, m.
+            local: (P, 3), or (P, 3, N) if the points differ between poses, m.
 
         Returns:
             (P, 3, N) m.
@@ -132,7 +132,7 @@ def joint_positions(skeleton: Skeleton, poses: ArrayLike, *, relative: bool = Fa
     """Joint positions (N, J, 3) of poses (N, d), camera frame or relative to the first joint, m.
 
     Raises:
-        ValueError: as `forward`.
+        ValueError: see `forward`.
     """
     return point_positions(
         skeleton, poses, skeleton.joint_segments, skeleton.joint_offsets, relative=relative
@@ -148,7 +148,7 @@ def point_positions(
         relative: whether positions are relative to the first point instead of the camera.
 
     Raises:
-        ValueError: as `forward`.
+        ValueError: see `forward`.
     """
     q = _checked(skeleton, poses)
     result = np.empty((len(q), len(segments), 3))
@@ -237,9 +237,9 @@ def point_energy(
     Args:
         frames: frames of N poses.
         segments: (P,) segments of the points.
-        local: (P, 3) places in the frames of the segments, m.
-        targets: (N, P, 3) camera frame, m.
-        across: (N, P, R, 3) A, such as the projection across a ray over a deviation, 1/m.
+        local: (P, 3) positions of the points in the frames of the segments, m.
+        targets: (N, P, 3) targets t, camera frame, m.
+        across: (N, P, R, 3) A, such as the projection across a ray divided by a deviation, 1/m.
 
     Returns:
         Value (N,), gradient (N, d), Gauss-Newton Hessian (N, d, d).
@@ -254,13 +254,13 @@ def point_energy(
 
 
 class Placing(NamedTuple):
-    """The skeleton, for the placement in compiled code.
+    """The skeleton, for forward kinematics in compiled code.
 
     Attributes:
-        parents: (S,) segment above; -1: none.
+        parents: (S,) parent of each segment; -1: none.
         first_dofs: (S + 1,) index of the first degree of freedom of each segment.
         dof_axes, dof_is_rotation: (d,).
-        mounts, offsets: (S, 3, 3), (S, 3) of the segments on their parents.
+        mounts, offsets: (S, 3, 3), (S, 3) mounts and offsets of the segments, see `Skeleton`.
     """
 
     parents: NDArray[np.int64]
@@ -273,7 +273,7 @@ class Placing(NamedTuple):
 
 @lru_cache(maxsize=16)
 def placing_of(skeleton: Skeleton) -> Placing:
-    """The compiled code's view of a skeleton."""
+    """The skeleton as compiled code reads it."""
     counts = [len(own) for own in skeleton.segment_dofs]
     return Placing(
         np.array(skeleton.parents, dtype=np.int64),
@@ -289,9 +289,9 @@ class Tree(NamedTuple):
     """The tree of the degrees of freedom, for compiled code.
 
     Attributes:
-        parents: (S,) segment above; -1: none.
+        parents: (S,) parent of each segment; -1: none.
         dof_segments: (d,) segment of each degree of freedom.
-        dof_parents: (d,) the degree of freedom before it on the path from the root; -1: none.
+        dof_parents: (d,) previous degree of freedom on the path from the root; -1: none.
         dof_is_rotation: (d,).
     """
 
@@ -303,7 +303,7 @@ class Tree(NamedTuple):
 
 @lru_cache(maxsize=16)
 def tree_of(skeleton: Skeleton) -> Tree:
-    """The compiled code's view of a skeleton."""
+    """The skeleton as compiled code reads it."""
     last_of: list[int] = []  # the last degree of freedom on the path to each segment
     before = np.full(skeleton.dimension, -1)
     for segment, parent in enumerate(skeleton.parents):

@@ -1,12 +1,12 @@
-"""Files of learned models: one .npz of plain arrays, tested with an example on reading.
+"""Files of learned models: one .npz of plain arrays, verified with an example on reading.
 
-An archive names its format, the version of the format and the kind of model. It holds the
-constructor's parameters as JSON and the learned arrays. A model inside another one keeps its
-arrays under a prefix: `nested` and `part`. A complete file also has
+An archive names its format, the version of the format and the kind of model. It has the
+constructor's parameters as JSON and the learned arrays. The arrays of a model inside another model
+have a prefix (`nested`, `part`). A complete file also has
 
-- `card`: what the model was learned from, under which licence, and how; JSON,
-- `checksum`: SHA-256 of all other arrays, which separates damaged files from wrong models,
-- `example/input` and `example/answer`: an input, and what the model predicts for it.
+- `card`: training data, licence and method; JSON,
+- `checksum`: SHA-256 of all other arrays, to distinguish damaged files from wrong models,
+- `example/input` and `example/answer`: an input, and the model's prediction for it.
 
 A reader builds the model, whose own code checks shapes and ranges. The arrays that the model would
 write must have the names, types and shapes of those in the file. For the stored input, the model
@@ -39,14 +39,14 @@ VERSION = 2
 
 Arrays = dict[str, NDArray[Any]]
 
-# Maximum sizes of a file: numbers and bytes of all arrays, characters of a text. Neighbours of
-# 80,000 silhouettes, with a model for rule (1), have 19 million numbers.
+# Maximum sizes of a file: numbers and bytes of all arrays, characters of a text. A neighbour model
+# with 80,000 silhouettes and a model for rule (1) has 19 million numbers.
 MOST_VALUES, LONGEST_TEXT = 20_000_000, 2**20
 LARGEST_FILE = 8 * MOST_VALUES
 # Maximum number of inputs or outputs of a model; a descriptor has a few hundred, a pose forty.
 MOST_NUMBERS = 10_000
-# Ranges of positive numbers and of variances, and the largest ratio of variances: products of a few
-# of them stay finite, and sums of covariances do not round off the smallest.
+# Ranges of positive numbers and of variances, and maximum ratio of variances. They keep products of
+# a few numbers finite, and small variances significant in sums of covariances.
 LEAST, LARGEST = 1e-15, 1e30
 LEAST_VARIANCE, LARGEST_VARIANCE, LARGEST_RATIO = 1e-25, 1e12, 1e13
 # Minimum eigenvalue of a correlation matrix for its Cholesky factor.
@@ -54,7 +54,7 @@ LEAST_EIGENVALUE = 1e-13
 # Maximum difference of an answer from the stored one, in standard deviations and in nats per
 # variable. Networks compute in single precision, which differs by up to 1e-5 between machines.
 TOLERANCE = 1e-3
-# Exceptions that wrong arrays cause anywhere.
+# Exceptions that wrong arrays can cause.
 FAULTS = (
     OSError,
     LookupError,
@@ -74,7 +74,7 @@ _INPUT, _ANSWER = 'example/input', 'example/answer'
 
 
 class LearnedModel(Protocol):
-    """Interface of a model that a file can hold."""
+    """Interface of a model that can be stored in a file."""
 
     def to_arrays(self) -> Arrays:
         """The header and the learned arrays."""
@@ -90,7 +90,7 @@ Model = TypeVar('Model', bound=LearnedModel)
 def named_faults(where: str) -> Iterator[None]:
     """Convert exceptions caused by wrong arrays to a ValueError of one line, with a path.
 
-    Only the texts of ValueErrors are repeated, as these never contain content of the file.
+    Only the texts of ValueErrors are repeated, because they never contain content of the file.
     """
     try:
         with np.errstate(all='ignore'):
@@ -123,7 +123,7 @@ def header(kind: str, parameters: Mapping[str, Any]) -> Arrays:
 
 
 def check_header(arrays: Mapping[str, NDArray[Any]], kind: str) -> None:
-    """Raise ValueError unless the arrays have the header of a model of a kind."""
+    """Raise ValueError unless the arrays have the header of a model of the given kind."""
     single = [name for name in _HEADER if name in arrays and not arrays[name].ndim]
     found = {name: str(arrays[name]) for name in single}
     require(found.get('format') == FORMAT, 'it is none of hmt_ros')
@@ -164,7 +164,8 @@ def check_covariances(name: str, values: Array, slack: float = -LEAST_EIGENVALUE
     """Checks covariances (..., D, D).
 
     Args:
-        slack: added to the eigenvalues of the correlations; above 0 it allows semidefinite ones.
+        slack: number added to the eigenvalues of correlation matrices; a positive number allows
+            semidefinite matrices.
 
     Raises:
         ValueError: they are not symmetric and positive definite, or variances are out of range.
@@ -192,9 +193,9 @@ def write_model(
     """Write a model completely or not at all, after checking that it can be read.
 
     Args:
-        path: File to write; '.npz' is appended where it is missing.
-        read: builds the model from its arrays. card: training data, licence and method,
-        serialisable as JSON.
+        path: File to write; '.npz' is appended if it is missing.
+        read: builds the model from its arrays.
+        card: training data, licence and method, serialisable as JSON.
         example: an input, for `LearnedModel.answer`.
 
     Returns:
@@ -207,7 +208,7 @@ def write_model(
     whole = {**card, 'numbers': sum(values.size for values in arrays.values())}
     arrays |= {'card': np.array(json.dumps(whole, sort_keys=True)), _INPUT: example}
     with named_faults(str(path)):
-        # The answer of a model in the precision of the file.
+        # The model read back, so that its answer has the precision of the file.
         arrays[_ANSWER] = _answer(read(arrays), arrays)
         arrays['checksum'] = np.array(checksum(arrays))
         checked_model(arrays, read)
@@ -218,7 +219,7 @@ def read_model(path: str | Path, kind: str, read: Callable[[Arrays], Model]) -> 
     """Read the model in a file.
 
     Args:
-        read: makes the model from its arrays.
+        read: builds the model from its arrays.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -236,7 +237,7 @@ def checked_model(arrays: Arrays, read: Callable[[Arrays], Model]) -> Model:
     """Build the model from the arrays of a complete file, and check it.
 
     Raises:
-        Exception: the arrays are damaged or wrong; some of `FAULTS`.
+        Exception: the arrays are damaged or wrong; one of `FAULTS`.
     """
     own = str(arrays.get('checksum'))
     require(own == checksum(arrays), 'it is damaged, its checksum is another one: copy it again')
@@ -295,7 +296,7 @@ def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> Path:
     """Writes an archive completely or not at all; the same arrays give the same bytes.
 
     Args:
-        path: File to write; '.npz' is appended where it is missing.
+        path: File to write; '.npz' is appended if it is missing.
 
     Returns:
         The path written.

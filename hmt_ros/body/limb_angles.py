@@ -1,13 +1,13 @@
 """Poses from joint positions, in closed form and frame by frame, to initialise retargeting.
 
-The solution of KJS 3 descends from the trunk outwards. With v the direction from the end of a
+The solution of KJS 3 proceeds from the trunk outwards. With v the direction from the end of a
 segment to its start, in the segment's frame before its rotations,
 
     v = (sin b, -sin a cos b, cos a cos b)
 
 gives the first two angles, independent of the lengths. The third angle, the twist, follows from the
 next segments or, if these are straight, from neighbouring frames. The result lies within the
-limits. It is exact for a body of the same lengths that can reach the pose, else approximate.
+limits. It is exact if the body has the same lengths and can reach the pose, else approximate.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ SIDES = ('left', 'right')
 ARM = ('shoulder', 'elbow', 'wrist', 'hand')
 LEG = ('hip', 'knee', 'ankle', 'toe')
 # Weights of the cues for the twist of a limb; a hinge bent by a right angle has weight 1.
-FOOT = 0.3  # a foot, for its leg
+FOOT = 0.3  # direction of the foot, for the leg
 AROUND, AROUND_TIME = 0.2, 0.2  # neighbouring frames; standard deviation of their time, s
-REST = 1e-3  # zero twist
+REST = 1e-3  # zero twist, the default
 HIPS = ('pelvis', 'left_hip', 'right_hip')
 TRUNK_START = 'start of the trunk'
-FLEXIBLE = 0.05  # weight of neck and shoulders for the root of a body whose trunk can bend
+FLEXIBLE = 0.05  # weight of neck and shoulders in the fit of the root, if the trunk can bend
 
 
 def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float | None) -> Array:
-    """Return poses (T, d) that follow joint positions by standard names.
+    """Fit poses (T, d) to joint positions with standard names.
 
     Args:
         skeleton: skeleton with the limbs of KJS fig. 3, such as those of the shipped bodies.
@@ -84,7 +84,7 @@ def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float | Non
 def trunk_start(skeleton: Skeleton, place: Mapping[str, Array]) -> Array:
     """Return the start of the trunk (T, 3), from the pelvis and the hips.
 
-    Its offset from the pelvis, relative to the drop of the hips, is that of the rest pose.
+    Its offset from the pelvis, in units of the distance from pelvis to hips, is as at rest.
     """
     if 'neck' not in skeleton.chains:
         return place['pelvis']
@@ -102,7 +102,7 @@ def trunk_start(skeleton: Skeleton, place: Mapping[str, Array]) -> Array:
 
 
 def _pelvis_axes(pelvis: Array, left: Array, right: Array) -> Array:
-    """Axes (T, 3, 3), in columns: from the pelvis to the hips, to the right, and across both."""
+    """Axes (T, 3, 3), in columns: from pelvis to hips, to the right, perpendicular to both."""
     down, across = 0.5 * (left + right) - pelvis, right - left
     down = down / np.maximum(np.linalg.norm(down, axis=1, keepdims=True), 1e-9)
     across = across - (across * down).sum(1, keepdims=True) * down
@@ -114,7 +114,7 @@ Aim = tuple[str, str, str]
 
 
 def _aims(skeleton: Skeleton) -> dict[int, Aim]:
-    """Return the joints at the start, the end and the next segment's end of aimed segments."""
+    """Return three joints per aimed segment: at its start, its end and the next segment's end."""
     result: dict[int, Aim] = {}
     try:
         head = skeleton.chains['neck'][0]
@@ -166,7 +166,7 @@ def _aligned(rest: Array, seen: Array, weights: Array) -> Array:
 
 
 def _smoothed(values: Array, sigma: float) -> Array:
-    """Smooth values (T, n) over time with Gaussian weights; the ends are extended constantly."""
+    """Smooth values (T, n) over time with Gaussian weights; the end values are repeated."""
     reach = int(4.0 * sigma + 0.5)
     weights = elementary.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     weights /= weights.sum()
@@ -183,10 +183,10 @@ def _twist(
     next_end: str,
     fps: float | None,
 ) -> Array:
-    """Return the third angle of a spherical joint, from the next segments.
+    """Return the third angle of a spherical joint, the twist, from the next segments.
 
-    A bent hinge of a limb determines it; so does a foot if the leg is straight; else the twist is
-    that of neighbouring frames. For the trunk the line of the shoulders determines it.
+    In a limb it follows from a bent hinge, or from the foot of a straight leg, or else from
+    neighbouring frames. In the trunk it follows from the line of the shoulders.
     """
     if not next_end:
         line = _local(turn, place['right_shoulder'] - place['left_shoulder'])
@@ -208,7 +208,7 @@ def _twist(
 
 
 def _local(turn: Array, direction: Array) -> Array:
-    """Unit vectors (T, 3) of directions, seen in frames (T, 3, 3)."""
+    """Unit vectors (T, 3) of directions, expressed in frames (T, 3, 3)."""
     norm = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
     result: Array = np.einsum('tij,ti->tj', turn, direction / norm)
     return result
@@ -227,7 +227,7 @@ def _turned(skeleton: Skeleton, dofs: Sequence[int], poses: Array, turn: Array) 
 
 
 def _within(poses: Array, skeleton: Skeleton) -> Array:
-    """Bring angles of poses into the limits by whole turns, else clip them."""
+    """Bring the angles of poses into the limits by whole turns, then clip them."""
     poses = poses.copy()
     lower, upper = skeleton.lower, skeleton.upper
     for i in np.flatnonzero(skeleton.dof_is_rotation):

@@ -1,13 +1,13 @@
-"""Mirror images of poses: left for right, and the reversal in depth, invisible in silhouettes.
+"""Mirror images of poses: left-right, and in depth, which silhouettes do not show.
 
-A body is symmetric, left for right. Mirrored in the plane through the pelvis across the line of
-sight, it has the same silhouette, apart from perspective: a person who approaches looks like one
-who walks away. The joint angles of that pose are those of the mirrored body, so they lie within the
-limits, too.
+A body is left-right symmetric. If it is mirrored in the plane through the pelvis across the line of
+sight, its silhouette stays the same, apart from perspective: a person who approaches looks like a
+person who walks away. The joint angles of the result are those of the left-right mirrored pose, so
+they lie within the limits, too.
 
-Angles without limits are equal modulo a whole turn. The heading of a turning person passes the cut,
-and two estimates of one heading may differ by a turn. Whole turns must be removed before poses are
-compared by their variables.
+Angles without limits are equal modulo a whole turn. The heading of a turning person can pass 180
+degrees, and two estimates of one heading may differ by a turn. Whole turns must be removed before
+poses are compared by their variables.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from hmt_ros.inference.mixture import GaussianMixture
 
 arctan2 = elementary.arctan2
 
-# Sine of the angle between a person's front and the image plane below which it is a side view.
+# Maximum sine of the angle between a person's front and the image plane in a side view.
 SIDEWAYS = 0.12
 # Axes of the root's rotations, in the order in which they act.
 ROOT_AXES = 'zyx'
 TURN = 2.0 * np.pi
-# Ratio of root angles to their limits below which they are clear of limits and poles.
+# Ratio of root angles to their limits below which they count as far from limits and poles.
 CLEAR = 0.85
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def mirror(body: Body, poses: ArrayLike) -> Array:
-    """Poses (N, d) of the mirror image, left for right: x in the camera frame changes its sign."""
+    """Left-right mirror images of poses (N, d): x in the camera frame changes its sign."""
     q = np.array(poses, dtype=np.float64, ndmin=2)
     order, signs = mirror_order(body.skeleton)
     result: Array = q[:, order] * signs
@@ -125,9 +125,9 @@ def turned(
     Args:
         body: body of the poses.
         poses: (N, d).
-        to: the same body, for the result.
+        to: the same body, with the level of the result.
         rotation: (3, 3) rotation of the roots, camera frame; None for no rotation.
-        turn: approximate rotation about z, which selects the whole turns of the result, rad.
+        turn: approximate rotation about z, rad; it selects the whole turns of the result.
     """
     root, rotations = root_rotation_dofs(body.skeleton), root_rotations(body, poses)
     angles = root_angles(to, rotations if rotation is None else product(rotation, rotations))
@@ -168,7 +168,7 @@ def relevelled(body: Body, mixture: GaussianMixture, to: Body) -> GaussianMixtur
 def clear_level(body: Body, pose: Array) -> Array:
     """Return a level (3, 3) with the root angles of a pose (d,) far from their limits.
 
-    It is the level of the body if they are, else this level rotated by quarter turns.
+    It is the level of the body if that suffices, else this level rotated by quarter turns.
     """
     best, least = body.level, CLEAR
     if not {*ROOT_ANGLES} <= {*body.dof_names}:
@@ -204,7 +204,7 @@ def trunk_of(body: Body) -> Trunk:
     """Return the trunk joints, which show where a person faces.
 
     Raises:
-        ValueError: a body without shoulders and hips.
+        ValueError: the body has neither shoulders nor hips.
     """
     if not body.trunk_pairs:
         raise ValueError(f'body {body.name} has neither shoulders nor hips: it faces nowhere')
@@ -215,7 +215,7 @@ def left_directions(body: Body, poses: Array) -> Array:
     """Unit vectors (N, 3) to the left of the persons in poses (N, d), in the camera frame.
 
     Raises:
-        ValueError: a body without shoulders and hips.
+        ValueError: the body has neither shoulders nor hips.
     """
     result = np.empty((len(poses), 3))
     point_left(trunk_of(body), body.joint_positions(poses), result)
@@ -223,13 +223,13 @@ def left_directions(body: Body, poses: Array) -> Array:
 
 
 def faces_back(body: Body, joints: Array, reference: Array) -> Mask:
-    """Whether persons with joints (N, J, 3) face another way than a reference (J, 3).
+    """Whether persons with joints (N, J, 3) face another direction than a reference (J, 3).
 
-    They face away from the reference, or one faces the camera while the other turns its back: in a
-    side view, a turn may continue either way.
+    True if the directions differ by more than 90 degrees, or if one person clearly faces the camera
+    and the other faces away: in a side view, a turn may continue either way.
 
     Raises:
-        ValueError: a body without shoulders and hips.
+        ValueError: the body has neither shoulders nor hips.
     """
     (neck,) = body.skeleton.joint_index(('neck',))
     result = np.empty(len(joints), dtype=np.bool_)
@@ -252,8 +252,8 @@ def free_limits(body: Body) -> tuple[Array, Array]:
 def without_turns(body: Body, poses: Array, before: Array) -> Array:
     """Shift angles of poses (K, d) to within half a turn of the nearest pose `before` (L, d).
 
-    The nearest pose has the least mean distance of joints relative to the first joint, which do not
-    depend on whole turns.
+    The nearest pose has the smallest mean distance between joints relative to the first joint,
+    which does not depend on whole turns.
     """
     joints, known = (body.relative_joints(x) for x in (poses, before))
     apart = joints[:, None] - known

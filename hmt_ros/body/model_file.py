@@ -6,7 +6,7 @@ Lengths vary over people by a common stature and by individual proportions:
     S_l = L0 (t^2 1 1' + diag(p^2)) L0,    L0 = diag(l0)
 
 to first order in the spreads. t is the spread of the stature, p_i the spread of the proportion of
-length i. Measurements of a person fix linear functions of the lengths, H l, with the covariance R:
+length i. Measurements of a person give linear functions H l of the lengths, with covariance R:
 
     S_l <- S_l - S_l H' (H S_l H' + R)^-1 H S_l
 """
@@ -39,10 +39,10 @@ AXES = {
     'tz': (2, False),
 }
 MIRROR = np.array([-1.0, 1.0, 1.0])
-DIFFUSION = (0.25, 1.4)  # of a root that the model file gives none, m and rad after one second
-FARTHEST = 1000.0  # m
+DIFFUSION = (0.25, 1.4)  # default of a root, m and rad after one second
+FARTHEST = 1000.0  # upper bound of lengths, m
 MOST_RINGS = 100
-LARGEST_FILE = 250_000  # bytes; a body is a few kB
+LARGEST_FILE = 250_000  # maximum size, bytes; a body is a few kB
 
 
 def model_names() -> list[str]:
@@ -87,7 +87,7 @@ def load_body(source: str | Path) -> Body:
 
 
 def named_body(name: str) -> Body:
-    """Return a shipped body by name; for names in messages, which must not open files.
+    """Return a shipped body by name; names from messages cannot open other files.
 
     Raises:
         FileNotFoundError: no body ships under this name.
@@ -124,19 +124,19 @@ def _shipped(name: str) -> dict[str, Any]:
 
 
 def usual_symmetries() -> Mapping[str, float]:
-    """Return the symmetries of human37, the default of bodies without a table of their own."""
+    """Return the symmetries of human37, the default for bodies without their own table."""
     result: Mapping[str, float] = _shipped('human37')['symmetries']
     return result
 
 
 def usual_postures() -> Mapping[str, Mapping[str, Any]]:
-    """Return the postures of human37, see `body.postures`; other bodies use shared entries."""
+    """Return the postures of human37, for all bodies; see `body.postures`."""
     result: Mapping[str, Mapping[str, Any]] = _shipped('human37')['postures']
     return result
 
 
 def joint_errors_of(joint_names: Sequence[str], table: Mapping[str, float] | None = None) -> Array:
-    """Return the errors (J,) of joints, m, from a table or else from human37; see `Body`.
+    """Return the errors (J,) of joints, m, from a table, by default human37's; see `Body`.
 
     A joint that the table lacks gets the largest error in the table.
 

@@ -1,8 +1,8 @@
 """The motion prior of a body: one object for the filter, the smoother and the prediction of poses.
 
-For a body with a learned file (`models/<name>_motion.npz`) poses have damped velocities whose
-changes are coupled; without one they are random walks with the rates of the body's YAML file. The
-card of the shipped file is in `docs/motion_prior.md`, and in the file itself.
+For a body with a learned file (`models/<name>_motion.npz`), poses have damped velocities with
+correlated changes. Without a file, poses are random walks with the rates of the body's YAML file.
+The card of the shipped file is in `docs/motion_prior.md`, and in the file itself.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class LearnedMotion:
         damping: (d,) share of the velocity lost per second.
         diffusion: (d, d) covariance that the velocity gains per second, (m/s)^2 and (rad/s)^2.
         white: (d,) additional variance that the pose gains per second, m^2 and rad^2.
-        card: data, method and licence, serialisable as JSON.
+        card: training data, method and licence, serialisable as JSON.
 
     Raises:
         ValueError: the values are not a valid motion prior.
@@ -67,7 +67,7 @@ class LearnedMotion:
         return DampedVelocity.of(self.damping, self.diffusion, self.white)
 
     def to_arrays(self) -> Arrays:
-        """The arrays of a file, with a precision of 32 bits."""
+        """The arrays of a file, in single precision."""
         parameters = {'body': self.body, 'dof_names': list(self.dof_names)}
         return header(KIND, parameters) | {
             'damping': self.damping.astype(np.float32),
@@ -92,7 +92,7 @@ class LearnedMotion:
         return made
 
     def answer(self, given: Array) -> GaussianMixture:
-        """The state that follows on a state (2 d,) after `INTERVAL`."""
+        """Predict the state after `INTERVAL` from a state (2 d,)."""
         nothing = np.zeros((1, len(given), len(given)))
         moved = self.dynamics.predict(given[None], nothing, INTERVAL)
         return GaussianMixture(np.ones(1), *moved)
@@ -108,20 +108,20 @@ def motion_prior(body: Body) -> LinearGaussianDynamics:
 
 @cache
 def shipped_motion(name: str) -> LearnedMotion | None:
-    """The motion prior that ships for the body of a name; None if missing.
+    """Return the shipped motion prior for the name of a body; None if missing.
 
     Raises:
-        ValueError: the file that ships is damaged.
+        ValueError: the shipped file is damaged.
     """
     file = shipped_file(name, 'motion')
     return None if file is None else read_motion_prior(file)
 
 
 def read_motion_prior(path: str | Path) -> LearnedMotion:
-    """A learned motion prior from a file.
+    """Read a learned motion prior from a file.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is no motion prior, or damaged; one line.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is not a motion prior, or is damaged; one line.
     """
     return read_model(path, KIND, LearnedMotion.from_arrays)

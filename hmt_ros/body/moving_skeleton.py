@@ -1,7 +1,7 @@
-"""A motion of a body as nodes that carry each other, and as BVH for other programs.
+"""Motion of a body as a tree of rotating nodes, and its export as BVH.
 
-A node is a joint at which a segment starts, or a joint at the end of one. Unturned nodes, which all
-have the axes of the room, make up the pose of zeros: upright, facing +z, y up. With G the rotation
+A node is a joint at the start or the end of a segment. In the zero pose all nodes have the axes of
+the room: the person stands upright and faces +z, with y up. With G the rotation
 of a segment and A the change of axes, a node that carries a segment is turned in the room by
 
     B(t) = A G(t) (A_rest G(rest))'        and in its parent by        B_parent(t)' B(t)
@@ -20,7 +20,7 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import product
 
-# From the optical frame of a level camera, y down and z forward, to y up and z to the camera.
+# From the optical frame of a level camera, y down and z forward, to y up and z towards the camera.
 CAMERA_TO_ROOM = np.diag([1.0, -1.0, -1.0])
 MOST_FRAMES = 1_000_000
 
@@ -31,10 +31,10 @@ class MovingSkeleton:
 
     Attributes:
         times: (T,) s, increasing.
-        names, parents: (N,) name and parent of each node, which stands before it; -1: the root.
-        offsets: (N, 3) from the parent, in its axes, m; 0 for the root.
+        names, parents: (N,) name and parent of each node; parents come first; -1: the root.
+        offsets: (N, 3) offset from the parent, in the parent's axes, m; 0 for the root.
         rotations: (T, N, 3, 3) from the axes of the node to those of its parent.
-        places: (T, 3) of the root.
+        places: (T, 3) positions of the root, m.
     """
 
     times: Array
@@ -55,10 +55,10 @@ class MovingSkeleton:
             poses: (T, d).
             times: (T,) s, increasing.
             room: (3, 3) rotation from the frame of the camera to axes with y up.
-            height: of the camera in the room, m.
+            height: height of the camera in the room, m.
 
         Raises:
-            ValueError: another segment has translations, or there are several roots.
+            ValueError: a segment other than the root has translations, or there are several roots.
         """
         skeleton = body.skeleton
         moved = skeleton.dof_segments[~skeleton.dof_is_rotation]
@@ -92,7 +92,7 @@ class MovingSkeleton:
         """Resample the motion by interpolation to regular times, `rate` per second.
 
         Raises:
-            ValueError: too many times.
+            ValueError: the result would have too many times.
         """
         count = 1 + int((self.times[-1] - self.times[0]) * rate + 0.01)
         if count > MOST_FRAMES:
@@ -110,7 +110,7 @@ class MovingSkeleton:
 
 
 def bvh_text(moving: MovingSkeleton, rate: float) -> str:
-    """BVH of a skeleton at even times, m and degrees; the same text for the same motion."""
+    """BVH text of a motion at regular times, m and degrees; equal motions give equal texts."""
     lines, order = ['HIERARCHY'], []
 
     def add(node: int, indent: str) -> None:
@@ -146,11 +146,11 @@ def _text(values: Array) -> str:
 def _angles(rotations: Array) -> Array:
     """Angles (T, N, 3) about z, x and y of rotations (T, N, 3, 3), degrees, without needless jumps.
 
-    Of the two triples for a rotation, and of their whole turns, those that are nearest to the ones
-    of the time before: programs interpolate angle by angle.
+    Two triples of angles, and their whole turns, give the same rotation. The result is the triple
+    nearest to the previous time, because programs interpolate each angle separately.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter('ignore')  # at 90 degrees about x, where one angle is free
+        warnings.simplefilter('ignore')  # at 90 degrees about x, one angle is free
         flat = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_euler('ZXY', degrees=True)
     angles: Array = flat.reshape(*rotations.shape[:2], 3)
     for t in range(1, len(angles)):

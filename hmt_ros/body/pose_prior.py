@@ -3,12 +3,13 @@
     E(x) = max log p - log p(a(x)) + 1/2 sum_j ((x_j - mean_j) / sigma_j)^2
 
 p is a mixture over the angles a of a pose (`angle_mixture`); the other degrees of freedom j (lean
-of the root, angles that recordings do not show) keep the Gaussians of the model file. With the
+of the root, angles missing in recordings) keep the Gaussians of the model file. With the
 responsibilities r_c of the components c, their precisions P_c and g_c = P_c (a - m_c):
 
     dE = sum_c r_c g_c,     H = sum_c r_c P_c,     d2E = H - sum_c r_c g_c g_c' + dE dE'
 
-H is positive definite, and the quadratic with the value and gradient of E that has it lies above E.
+H is positive definite, and the quadratic with Hessian H and the value and gradient of E is an upper
+bound of E.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class AnglePrior:
 
     @cached_property
     def compiled(self) -> PriorModel:
-        """As compiled code reads it."""
+        """The prior as compiled code reads it."""
         return PriorModel(
             np.zeros((1, 0, 0)),
             np.zeros((1, 0, 0)),
@@ -65,8 +66,8 @@ class MixturePrior:
     """The learned prior of the poses, zero at the most probable pose.
 
     Attributes:
-        body: whose poses; its Gaussians hold for the degrees of freedom beside the mixture.
-        mixture: over the angles.
+        body: body of the poses; its Gaussians cover degrees of freedom missing in the mixture.
+        mixture: mixture over the angles.
         weight: factor on the energy.
     """
 
@@ -76,7 +77,7 @@ class MixturePrior:
 
     @cached_property
     def compiled(self) -> PriorModel:
-        """As compiled code reads it."""
+        """The prior as compiled code reads it."""
         mixture, whole = self.mixture, self.mixture.whole
         n = whole.dimension
         log_det = -elementary.log(np.diagonal(mixture.whitening, axis1=1, axis2=2)).sum(1)
@@ -112,9 +113,9 @@ def pose_prior(body: Body, kind: str, weight: float) -> AnglePrior | MixturePrio
     """The soft prior of the poses of a body.
 
     Args:
-        body: whose poses.
-        kind: 'learned', or 'angles' for the independent Gaussians of the model file, which bodies
-            without a learned prior have in either case.
+        body: body of the poses.
+        kind: 'learned', or 'angles' for the independent Gaussians of the model file; bodies without
+            a learned prior always get the latter.
         weight: factor on the energy.
 
     Raises:
@@ -138,14 +139,14 @@ class PriorModel(NamedTuple):
     """The prior, for compiled code.
 
     Attributes:
-        whitening: (C, n, m) inverse Cholesky factors W of the covariances, lower triangular, in
-            rows of whole lanes.
-        columns: (C, n, m) the same of the transposed W.
-        centres: (C, n) W m.
-        constants: (C,) log of the weight times the normalisation, over the highest density.
-        precisions: (C, n, n).
+        whitening: (C, n, m) inverse Cholesky factors W of the covariances, lower triangular, with
+            rows padded to whole lanes.
+        columns: (C, n, m) transposed factors W', padded as well.
+        centres: (C, n) whitened means W m.
+        constants: (C,) log of the weight times the normalisation, minus the highest log density.
+        precisions: (C, n, n) inverse covariances.
         places: (n,) degrees of freedom that the mixture covers.
-        means, rest: (d,) means, and precisions of the degrees of freedom beside the mixture.
+        means, rest: (d,) means, and precisions of degrees of freedom missing in the mixture.
         weight: factor on the energy.
     """
 

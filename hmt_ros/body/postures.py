@@ -1,12 +1,12 @@
 """Postures of limbs that no image shows: standing, striding, sitting, kneeling.
 
     p(x) = sum_c q_c prod_i N(x_i; m_ci, s_ci^2)                    angles i of the limbs
-    y_i ~ N(x_i, S_ii + b_i t_i)                                    where a mode says that they are
+    y_i ~ N(x_i, S_ii + b_i t_i)                                    angles i according to a mode
 
-The modes (y, S) of a tracker locate the limbs that an image shows. Their information on a hidden
-limb decays, as its angles diffuse at the rates b of the body for the time t since it was last seen;
-it is zero for a limb that was never seen. Postures are narrow, so within a posture a linear map
-from angles to joints is accurate enough.
+The modes (y, S) of a tracker locate the limbs that an image shows. Their information about a hidden
+limb decays, because its angles diffuse at the rates b of the body for the time t since it was last
+seen. There is no information about a limb that was never seen. Postures are narrow, so within a
+posture a linear map from angles to joints is accurate enough.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import log_sum_exp, product, pseudo_inverse
 from hmt_ros.inference.mixture import GaussianMixture
 
-# Share of the mode's own prediction for a limb that has not been seen for much longer than the time
-# constant, and this constant, s; the share decays from 1. Chosen on clips.
+# Share of the mode's own prediction for a limb hidden for a long time, and time constant of the
+# decay from 1 to this share, s. Chosen on clips.
 SUPPOSED, FORGOTTEN = 0.5, 1.0
-# Minimum weight, over all modes and postures, of a posture that is kept.
+# Minimum weight of a component, a posture of a mode, that is kept.
 LIGHTEST = 0.006
 # Joints that stay fixed while the pelvis turns.
 TOP = ('neck', 'left_shoulder', 'right_shoulder')
@@ -39,7 +39,7 @@ class Postures:
     Attributes:
         body: body of the angles.
         shares: (P,) prior probabilities of the postures.
-        means, sigmas: (P, d) of the degrees of freedom.
+        means, sigmas: (P, d) means and standard deviations of the degrees of freedom.
     """
 
     body: Body
@@ -51,13 +51,13 @@ class Postures:
         """Spread the unseen angles of modes over postures.
 
         Args:
-            modes: K of them over poses (d,).
+            modes: K modes over poses (d,).
             unseen: (d,) time since an image last showed each angle, s; 0: the current image; inf:
                 never.
 
         Returns:
-            A component for each mode, and for each posture that it may be in instead, heaviest
-            first; (N,) the mode of each, and (N,) the number of the posture, 0 for the mode's own.
+            N components, heaviest first: each mode, and each mode with each likely posture; the
+            mode of each component (N,); and its posture (N,), 0 for the mode's own.
         """
         spine = np.isin(self.body.skeleton.dof_segments, self.body.skeleton.spine)
         hidden, variances = np.flatnonzero((unseen > 0.0) & ~spine), self.sigmas**2
@@ -95,11 +95,12 @@ class Postures:
     def _swaying(self, poses: Array, unseen: Array) -> Array:
         """Return covariances (N, d, d) of a pelvis that turns below a fixed trunk.
 
-        The angles between them are the soft prior's, or have wandered for less time than that.
+        The angles between pelvis and trunk have the variances of the soft prior, or smaller ones
+        if they were seen recently.
 
         Args:
             poses: (N, d).
-            unseen: (d,) times of these angles, s; 0 of the others.
+            unseen: (d,) time since an image last showed each of these angles, s; 0 for others.
         """
         skeleton = self.body.skeleton
         own = np.flatnonzero(unseen > 0.0)

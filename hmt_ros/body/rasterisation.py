@@ -19,8 +19,8 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.inference.arrays import Array, Index, Mask
 
 STACKS, SLICES = 13, 18  # mesh of a part; its outline is exact to 2 % of its radius
-SMALLEST_AREA = 1e-6  # px^2, of twice a triangle: a smaller one covers the centre of no pixel
-CHUNK = 16  # poses whose silhouettes are drawn together
+SMALLEST_AREA = 1e-6  # px^2, twice the area of a triangle; smaller ones cover no pixel centre
+CHUNK = 16  # number of poses whose silhouettes are drawn together
 
 
 def render_silhouettes(body: Body, poses: ArrayLike, camera: Camera) -> Mask:
@@ -67,7 +67,7 @@ def mesh_of(body: Body) -> Mesh:
     if not body.shapes:
         raise ValueError(f'body {body.name} has no flesh: it can not be drawn')
     mesh = body.flesh.mesh(STACKS, SLICES)
-    # The order of the corners decides which triangles face the camera: make it fit the normals.
+    # The order of corners decides which triangles face the camera, so make it match the normals.
     a, b, c = mesh.vertices[mesh.triangles.T]
     inwards = np.einsum('fx,fx->f', np.cross(b - a, c - a), mesh.normals[mesh.triangles[:, 0]]) < 0
     triangles = np.where(inwards[:, None], mesh.triangles[:, ::-1], mesh.triangles)
@@ -94,7 +94,7 @@ def project(mesh: Mesh, points: Array, camera: Camera) -> Triangles:
     # camera is NaN, and the triangle is left out.
     area = (u[b] - u[a]) * (v[c] - v[a]) - (v[b] - v[a]) * (u[c] - u[a])
     visible = area < -SMALLEST_AREA
-    # Far outside the image a distortion model may fold back into it.
+    # Far outside the image, a distortion model may map points back into it.
     (left, right), (top, bottom) = _field_of_view(camera)
     x, y, z = p
     sides = (x < left * z, x > right * z, y < top * z, y > bottom * z)
@@ -107,14 +107,14 @@ def project(mesh: Mesh, points: Array, camera: Camera) -> Triangles:
 
 
 def fill(triangles: Triangles, height: int, width: int) -> Filled:
-    """All pixels whose centres lie in triangles, whether or not another triangle hides them."""
-    # Corners from top to bottom. Both triangles at an edge then compute its places alike, and every
-    # pixel goes to one of them.
+    """All pixels whose centres lie in triangles, including triangles hidden by others."""
+    # Sort corners from top to bottom, so that both triangles at an edge compute the same positions
+    # and each pixel belongs to only one of them.
     order = np.argsort(triangles.v, axis=0, kind='stable')
     u0, u1, u2 = np.take_along_axis(triangles.u, order, axis=0)
     v0, v1, v2 = np.take_along_axis(triangles.v, order, axis=0)
     rows, which = _ranges(_first(v0, height), _first(v2, height))
-    with np.errstate(divide='ignore', invalid='ignore'):  # an edge along a row is never asked
+    with np.errstate(divide='ignore', invalid='ignore'):  # horizontal edges are not used
         upper, lower, long = (u1 - u0) / (v1 - v0), (u2 - u1) / (v2 - v1), (u2 - u0) / (v2 - v0)
     below = rows >= v1[which]
     one = u0[which] + long[which] * (rows - v0[which])

@@ -60,9 +60,9 @@ NEEDED = (
         for joint in ('hip', 'knee', 'ankle', 'shoulder', 'elbow', 'wrist')
     ),
 )
-# Sine of the angle below which two bones are parallel; length below which it counts as 0, m.
+# Sine of the angle below which two bones count as parallel; length that counts as zero, m.
 _STRAIGHT, _NOTHING = 1e-4, 1e-3
-# Angle of the hips in front of the vertical through the pelvis joint in our bodies, rad.
+# Angle by which our bodies have the hips in front of the vertical through the pelvis joint, rad.
 HIPS_AHEAD = elementary.arctan(0.33)
 # Weight of the change of angles between images relative to the excess over their ranges.
 _STEADY = 0.2
@@ -105,7 +105,7 @@ class ReferenceHuman:
     def links(self) -> tuple[list[str], Array, Array]:
         """Return names (L), rotations (L, 3, 3) and origins (L, 3), m, of all links but the body.
 
-        Both are in the frame of the body.
+        Rotations and origins are in the frame of the body.
         """
         frames = {'body': (np.eye(3), np.zeros(3))}
         for joint in self.joints:
@@ -128,10 +128,10 @@ def fit_reference_human(
 ) -> ReferenceHuman:
     """Fit the reference model to joint positions.
 
-    A direction of a limb allows two sets of angles; the set within the ranges of the reference and
-    near the last angles is chosen. Angles that positions do not determine keep their last values:
-    the roll of a straight limb, the yaw of a limb that hangs straight down. Positions never
-    determine the turn of the head: `y_head` is 0.
+    Two sets of angles give the same direction of a limb; the set within the ranges of the reference
+    and near the previous angles is chosen. Angles that positions do not determine keep their
+    previous values: the roll of a straight limb, the yaw of a limb that hangs straight down.
+    Positions never determine the turn of the head: `y_head` is 0.
 
     Args:
         names: (J) names of the joints.
@@ -187,7 +187,7 @@ def _unit(vector: Array, what: str) -> Array:
 
 
 def _body_axes(at: Mapping[str, Array], origin: Array) -> Array:
-    """Return columns x forward, y from the right hip to the left, z up along the pelvis."""
+    """Return axes (3, 3), in columns: forward, from right to left hip, and up the pelvis."""
     y = _direction(at, 'right_hip', 'left_hip')
     up = at['pelvis'] - origin
     up = elementary.cos(HIPS_AHEAD) * up + elementary.sin(HIPS_AHEAD) * np.cross(y, up)
@@ -263,7 +263,7 @@ def _fit_leg(
         a = float(elementary.arctan2(y[0], y[1])) if level else before[names[0]]
         turns = [(a, b), (a + np.pi, np.pi - b)]
     else:
-        # With the last yaw: the direction of the thigh is Rz(-a) Rx(s b) (sin c, 0, -cos c).
+        # Keep the last yaw; the direction of the thigh is Rz(-a) Rx(s b) (sin c, 0, -cos c).
         a = before[names[0]]
         x, y_, z = product(_turn_z(a), thigh)
         turns = [(a, float(elementary.arctan2(y_, -z))), (a, float(elementary.arctan2(-y_, z)))]
@@ -289,14 +289,14 @@ def _best_angles(
 
 
 def _wrapped(angle: float) -> float:
-    """The angle in [-pi, pi)."""
+    """Wrap an angle to [-pi, pi)."""
     return float((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _joints(
     at: Mapping[str, Array], ahead: Mapping[str, float], *, additions: bool
 ) -> tuple[Joint, ...]:
-    """Return the joints of the model, with the lengths of positions in the body's frame.
+    """Return the joints of the model, with lengths from joint positions in the body's frame.
 
     Args:
         ahead: distance of the shoulders in front of the neck, by side, m.

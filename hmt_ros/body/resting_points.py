@@ -1,16 +1,17 @@
-"""Points of a body that rest on the ground do not move from one image to the next.
+"""Prior of trajectories with points of the body at rest on the ground, which do not move.
 
-Whether a point rests or moves is a Markov chain that switches `CHANGES` times a second. The speed
-of the point along a trajectory is the evidence,
+Whether a point rests or moves is a Markov chain with the rate `CHANGES`. The evidence is the speed
+of the point along a trajectory,
 
     rests: v_across ~ N(0, 0.07^2), v_away ~ N(0, 0.17^2)    moves: N(0, 0.7^2), N(0, 0.6^2)   m/s
 
 across and along the most uncertain direction of a point, approximately the line of sight. Between
 two images a point that rests with probability r costs
 
-    r |p(x_{t+1}) - p(x_t)|^2 / (2 q dt)                      q: what a resting point slips, m^2/s
+    r |p(x_{t+1}) - p(x_t)|^2 / (2 q dt)                      q: slip of a resting point, m^2/s
 
-linear in the poses near a trajectory, and so added to its prior (1) as a Gaussian.
+The difference is linear in the poses near a trajectory, so the cost is added to the trajectory's
+prior (1) as a Gaussian.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
 # Standard deviations of the speed across and along the most uncertain direction, of resting and of
 # moving points in trajectories of the smoother, m/s; from the feet of the clips.
 RESTS, MOVES = (0.07, 0.17), (0.7, 0.6)
-# Rate of changes of a point between rest and motion, 1/s.
+# Rate at which a point changes between rest and motion, 1/s.
 CHANGES = 2.0
 # Variance of the slip of a resting point, m^2/s: 9 mm in a second.
 SLIP = 8e-5
@@ -45,7 +46,7 @@ class RestingTable(NamedTuple):
 
     Attributes:
         jacobians: (T, R, d).
-        places: (T, R) linearised coordinates at the pose 0, m.
+        places: (T, R) linearised coordinates, extrapolated to the pose 0, m.
         weights: (T-1, R) r / (q dt).
     """
 
@@ -84,7 +85,7 @@ class RestingPoints:
         """Return the resting points along a trajectory, or None if no point rests.
 
         Args:
-            poses: (T, d) at which rest is decided and points are linearised.
+            poses: (T, d) poses from which rest is estimated and at which points are linearised.
             covariances: (T, d, d) of the poses.
             intervals: (T-1,) s.
         """

@@ -1,4 +1,4 @@
-"""Rotation matrices and the vectors along their axes, whose lengths are their angles."""
+"""Conversion between rotation matrices and rotation vectors (axis times angle)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from hmt_ros.inference.linear_algebra import product
 
 
 def rotation_vectors(rotations: Array) -> Array:
-    """Vectors (..., 3), rad, of rotations (..., 3, 3), of angles up to pi."""
-    # The quaternion w x y z from its largest number, see Shepperd, 1978.
+    """Rotation vectors (..., 3), rad, at most pi long, of rotation matrices (..., 3, 3)."""
+    # The quaternion w x y z from its largest element, see Shepperd, 1978.
     r = rotations
     trace = r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2]
     squares = np.stack([trace, r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]], axis=-1)
@@ -30,7 +30,7 @@ def rotation_vectors(rotations: Array) -> Array:
     q = q * np.where(q[..., :1] < 0.0, -1.0, 1.0)
     length = np.sqrt((q[..., 1:] ** 2).sum(-1, keepdims=True))
     angle = 2.0 * elementary.arctan2(length, q[..., :1])
-    # Half the quaternion's scale is that of small angles.
+    # For small angles, the ratio of angle to length is 2 / w.
     scale = np.divide(
         angle, length, out=2.0 / np.maximum(q[..., :1], 1e-300), where=length > 1e-12 * q[..., :1]
     )
@@ -38,7 +38,7 @@ def rotation_vectors(rotations: Array) -> Array:
 
 
 def rotations_of(vectors: Array) -> Array:
-    """Rotations (..., 3, 3) of vectors (..., 3), rad; Rodrigues' formula."""
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), rad; Rodrigues' formula."""
     angle = np.sqrt((vectors**2).sum(-1))[..., None, None]
     x, y, z = np.moveaxis(vectors, -1, 0)
     o = np.zeros_like(x)

@@ -1,7 +1,7 @@
 """Soft prior against intersections of parts of the body (KJS 2).
 
-Two parts overlap by the sum of their radii minus the distance of their axes, taken along the line
-that connects the axes where they are nearest; the overlap is penalised quadratically.
+The overlap of two parts is the sum of their radii minus the distance of their axes, both along the
+shortest line between the axes. The penalty is quadratic in the overlap.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.core import overlap_depths
 from hmt_ros.inference.arrays import Array, Index
 
-TOLERANCE = 0.02  # m of overlap without cost: flesh is soft, and ellipsoids fit roughly
+TOLERANCE = 0.02  # overlap without cost, m: flesh is soft, and ellipsoids are approximate
 
 
 class _Axes(NamedTuple):
     """The parts as capsules with elliptic cross-sections, for compiled code.
 
     Attributes:
-        segments: (B,) that carry them.
-        centres: (B, 3) of the axes in the segments' frames, m.
+        segments: (B,) segments that carry the parts.
+        centres: (B, 3) centres of the axes in the segments' frames, m.
         halves: (B,) half lengths of the axes, m.
-        radii: (B, 3) along x, y and, for the caps, z, m.
-        reaches: (B,) from the middle to the farthest point, m.
+        radii: (B, 3) radii along x, y and, for the caps, z, m.
+        reaches: (B,) distances from the centre to the farthest point, m.
     """
 
     segments: NDArray[np.int64]
@@ -40,12 +40,12 @@ class _Axes(NamedTuple):
 
 
 class Overlaps(NamedTuple):
-    """Parts, the pairs (Q,) of them that may overlap, and the variables that move them.
+    """Parts, the Q pairs of parts that may overlap, and the variables that move them.
 
     Attributes:
-        parts: of the body.
-        first, second: (Q,) of the pairs.
-        dof_is_rotation, moves: (d,), (S, d) of the skeleton.
+        parts: parts of the body.
+        first, second: (Q,) indices of the parts of each pair.
+        dof_is_rotation, moves: (d,), (S, d) see `Skeleton`.
         sigma: overlap with energy 1/2, m.
         tolerance: overlap without cost, m.
     """
@@ -63,10 +63,10 @@ class Overlaps(NamedTuple):
 class SelfIntersection:
     """The prior against intersections of parts of the body.
 
-    Its derivatives are those of the distance; rotations of elliptic cross-sections are neglected.
+    Derivatives neglect the change of radii as elliptic cross-sections rotate.
 
     Attributes:
-        body: whose parts; those that are neighbours along the skeleton are left out.
+        body: body of the parts; pairs of neighbours along the skeleton are left out.
         sigma: overlap with energy 1/2, m; inf switches the prior off.
     """
 
@@ -75,7 +75,7 @@ class SelfIntersection:
 
     @property
     def compiled(self) -> Overlaps:
-        """As compiled code reads it."""
+        """The prior as compiled code reads it."""
         return overlaps_of(self.body, self.sigma)
 
 

@@ -3,14 +3,14 @@
     theta = (lengths - lengths of the body, growth of each group of parts)
 
 Left and right parts grow equally, so a group is a part or a pair of parts. A point p on a part
-moves with the shape: its segment moves with the lengths above it, and on the part it has the
-constant relative position u = (p - c) / r, for the radii r and the centre c, which depend on the
-shape:
+moves with the shape: its segment moves with the lengths of its ancestors, and on the part it has
+the constant relative position u = (p - c) / r, for the radii r and the centre c, which depend on
+the shape:
 
     dp / dtheta = d origin / dtheta + R (dc / dtheta + u dr / dtheta)
 
-At the occluding contour this is also the derivative of the contour across itself, because the
-surface only slides along it (envelope theorem).
+This is also the derivative of the occluding contour perpendicular to itself, because points of the
+surface only slide along the contour (envelope theorem).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hmt_ros.body.kinematics import Frames, origin_length_jacobians, placing_of
 from hmt_ros.core import sum_shape_residuals
 from hmt_ros.inference.arrays import Array, Mask
 
-# Standard deviations over people and clothes, by kind of growth: logarithms, m.
+# Standard deviations over people and clothes, by kind of growth; see `GROWTH` for units.
 GROWTH_SIGMAS = dict(zip(GROWTH, (0.2, 0.2, 0.02, 0.02, 0.02), strict=True))
 # Minimum standard deviation of a length, m.
 MIN_LENGTH_SIGMA = 0.008
@@ -39,7 +39,7 @@ class ShapeSpace:
         body: body at which derivatives are taken; the vector 0 leaves it unchanged.
 
     Attributes:
-        body: the same.
+        body: body at which derivatives are taken.
         groups: names of the groups of parts, without sides.
     """
 
@@ -52,7 +52,7 @@ class ShapeSpace:
 
     @property
     def lengths(self) -> int:
-        """Number of lengths, L; they come first."""
+        """Number of lengths, L, the first variables."""
         return len(self.body.skeleton.length_names)
 
     @property
@@ -89,13 +89,13 @@ class ShapeSpace:
     def second_order(
         self, frames: Frames, of_flesh: Array, of_joints: Array
     ) -> tuple[Array, Array, Array]:
-        """Sum over residuals of N poses with derivatives r by shape and q by pose.
+        """Sum over residuals of N poses; r and q are their derivatives by shape and pose.
 
         Args:
             frames: frames of the poses.
-            of_flesh: (N, 1 + M, 9) residuals of points on the flesh: rows 1 to m of a pose are
-                segment, point and derivative a of the residual by it, camera frame, derivative g
-                and curvature c of the energy by the residual; m is the first number of row 0.
+            of_flesh: (N, 1 + M, 9) residuals of points on the flesh. Row 0 starts with the count m.
+                Rows 1 to m contain the segment, the point and the derivative of the residual by the
+                point, camera frame, and derivative g and curvature c of the energy by the residual.
             of_joints: the same for joints, with joints in place of segments.
 
         Returns:
@@ -184,9 +184,9 @@ class _ShapeTable(NamedTuple):
     Attributes:
         part_of: (S,) part on each segment; -1 if missing.
         centres, radii: (B, 3) of the parts.
-        by_centre, by_radius: (B, 3, P) their derivatives.
+        by_centre, by_radius: (B, 3, P) derivatives of centres and radii by the variables.
         joint_basis: (J, 3, L) of the skeleton.
-        variables, counts: (S, V), (S,) the variables that move the flesh of each segment.
+        variables, counts: (S, V), (S,) variables that move the flesh of each segment; their number.
     """
 
     part_of: NDArray[np.int64]

@@ -1,7 +1,7 @@
 """The skeleton: a tree of segments, their degrees of freedom, and the lengths that shape them.
 
-Every segment has a frame. In its parent's frame it has an offset, moved by its translations, and a
-fixed mount rotation, followed by its own rotations one after the other:
+Every segment has a frame. Relative to its parent's frame it has an offset, to which its
+translations are added, and a fixed mount rotation, followed by its own rotations in order:
 
     T_segment = T_parent * Trans(offset + t) * mount * Rot(axis_1, q_1) * ... * Rot(axis_n, q_n)
 
@@ -183,11 +183,11 @@ class Skeleton:
     @cached_property
     def bones(self) -> tuple[tuple[int, int], ...]:
         """Pairs (parent joint, child joint) that a drawing of the skeleton connects."""
-        at_start: dict[int, int] = {}  # the first joint that sits at a segment's origin
+        at_start: dict[int, int] = {}  # the first joint at each segment's origin
         for j, s in enumerate(self.joint_segments):
             if not np.any(self.joint_offsets[j]):
                 at_start.setdefault(int(s), j)
-        for s, parent in enumerate(self.parents):  # a segment that starts where its sibling does
+        for s, parent in enumerate(self.parents):  # a segment with the same start as a sibling
             for other, joint in list(at_start.items()):
                 same = parent == self.parents[other] and parent >= 0
                 if s not in at_start and same and np.allclose(self.offsets[s], self.offsets[other]):
@@ -205,7 +205,7 @@ class Skeleton:
         """Positions of named degrees of freedom in a pose.
 
         Raises:
-            KeyError: a name that the skeleton does not have.
+            KeyError: the skeleton lacks a name.
         """
         return _positions(tuple(names), self.dof_names, 'degree of freedom', self.name)
 
@@ -213,7 +213,7 @@ class Skeleton:
         """Positions of named joints.
 
         Raises:
-            KeyError: a name that the skeleton does not have.
+            KeyError: the skeleton lacks a name.
         """
         return _positions(tuple(names), self.joint_names, 'joint', self.name)
 
@@ -221,7 +221,7 @@ class Skeleton:
         """Return the same skeleton with other values (m) of some lengths.
 
         Raises:
-            KeyError: a name that the skeleton does not have.
+            KeyError: the skeleton lacks a name.
             ValueError: a length is not finite.
         """
         new = self.lengths.copy()
@@ -259,7 +259,7 @@ def other_side(name: str) -> str:
 
 @lru_cache(maxsize=256)
 def _positions(names: tuple[str, ...], known: tuple[str, ...], kind: str, owner: str) -> Index:
-    """Return a read-only array of positions of names in the known names."""
+    """Return the positions of names among the known names, as a read-only array."""
     place = {name: i for i, name in enumerate(known)}
     missing = [name for name in names if name not in place]
     if missing:

@@ -1,11 +1,11 @@
-// What the core offers Python in place of numpy's functions of arrays.
+// Functions of the core that replace numpy's functions of arrays.
 #pragma once
 
 #include <Python.h>
 
 namespace hmt {
 
-// A module that gets such functions, and the table of numpy's C interface that makes them.
+// The module that gets these functions, and the table of numpy's C API that creates them.
 struct UfuncModule {
   PyObject* object;
   void** numpy;

@@ -1,4 +1,4 @@
-// Arrays that somebody else owns, scratch space, and checks of what comes in from Python.
+// Non-owning arrays, scratch space, and checks of arguments from Python.
 #pragma once
 
 #include <algorithm>
@@ -21,7 +21,7 @@ inline constexpr double infinity = std::numeric_limits<double>::infinity();
 inline constexpr double nan = std::numeric_limits<double>::quiet_NaN();
 inline constexpr double pi = 3.14159265358979323846;
 
-// A contiguous array of N axes, row by row; `const` elements are only read.
+// A contiguous row-major array with N axes; arrays of `const` elements are inputs.
 template <class T, int N>
 struct Array {
   T* data = nullptr;
@@ -35,7 +35,7 @@ struct Array {
   }
   bool empty() const { return count() == 0; }
 
-  // An element of a vector, or a row of an array: itself an array of one axis fewer.
+  // An element of a vector, or a row of an array, which is an array with one axis fewer.
   decltype(auto) operator[](Index i) const {
     if constexpr (N == 1) {
       return static_cast<T&>(data[i]);
@@ -58,7 +58,7 @@ struct Array {
   T* begin() const { return data; }
   T* end() const { return data + count(); }
 
-  // The rows from `first` up to `last`.
+  // The rows from `first` to `last` - 1.
   Array rows(Index first, Index last) const {
     Array part = *this;
     Index stride = 1;
@@ -81,13 +81,13 @@ struct Array {
 using Vector = Array<double, 1>;
 using Matrix = Array<double, 2>;
 using Tensor = Array<double, 3>;
-using Numbers = Array<const double, 1>;  // a vector that is only read
+using Numbers = Array<const double, 1>;  // a read-only vector
 using Table = Array<const double, 2>;
 using Tables = Array<const double, 3>;
 using Places = Array<const Index, 1>;
 using Mask = Array<const bool, 1>;
 
-// An argument that does not fit; Python raises it as ValueError.
+// An invalid argument; Python raises it as ValueError.
 struct Misfit : std::invalid_argument {
   using std::invalid_argument::invalid_argument;
 };
@@ -100,7 +100,7 @@ inline std::string in_brackets(const Index* shape, int axes) {
   return text + (axes == 1 ? ",)" : ")");
 }
 
-// How many elements scratch space has, which arrays with absurd extents would make endless.
+// Number of elements of scratch space, with a limit because wrong extents may be huge.
 [[gnu::noinline]] inline std::size_t scratch_size(const Index* shape, int axes) {
   constexpr Index limit = Index(1) << 27;
   Index count = 1;
@@ -114,14 +114,14 @@ inline std::string in_brackets(const Index* shape, int axes) {
   return static_cast<std::size_t>(count);
 }
 
-// Scratch space, zero at first: an array that owns its elements.
+// Scratch space: an array that owns its elements, initially zero.
 template <class T, int N>
 class Scratch {
  public:
   template <class... I>
   explicit Scratch(I... extents) {
     view_.shape = {static_cast<Index>(extents)...};
-    // Not std::vector<bool>, which has no array of bool.
+    // Not std::vector, because std::vector<bool> contains no array of bool.
     elements_ = std::make_unique<T[]>(scratch_size(view_.shape.data(), N));
     view_.data = elements_.get();
   }
@@ -141,7 +141,7 @@ class Scratch {
   Array<T, N> view_;
 };
 
-// As Python compares: the first where neither is smaller, and where one is no number.
+// Comparisons as in Python: they return the first number if neither is smaller or one is NaN.
 inline double least(double a, double b) { return b < a ? b : a; }
 inline double most(double a, double b) { return b > a ? b : a; }
 inline double between(double x, double low, double high) { return least(most(x, low), high); }
@@ -154,7 +154,7 @@ inline std::array<double, 3> cross(const double* a, const double* b) {
 }
 inline double sign(double x) { return x > 0.0 ? 1.0 : x < 0.0 ? -1.0 : x; }
 
-// Where the first of the largest is, or the first that is no number; as numpy.argmax.
+// Index of the first largest number, or of the first NaN, as numpy.argmax.
 inline Index place_of_largest(const Numbers& numbers) {
   Index place = 0;
   for (Index i = 0; i < numbers.size(); ++i) {
@@ -164,7 +164,7 @@ inline Index place_of_largest(const Numbers& numbers) {
   return place;
 }
 
-// An array of this name must have these extents; -1 fits any.
+// Checks that an array has the wanted extents; -1 allows any extent.
 template <class T, int N>
 [[gnu::noinline]] void expect_shape(const char* name, const Array<T, N>& array,
                                     std::array<Index, N> wanted) {
@@ -176,7 +176,7 @@ template <class T, int N>
   }
 }
 
-// All entries must be at least `low` and less than `high`.
+// Checks that all entries are at least `low` and less than `high`.
 template <class T, int N>
 [[gnu::noinline]] void expect_range(const char* name, const Array<T, N>& array, Index low,
                                     Index high) {

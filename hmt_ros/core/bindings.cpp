@@ -1,4 +1,4 @@
-// What Python calls, and the names of its arguments; each function is described where it is.
+// Functions for Python and the names of their arguments; headers describe the functions.
 #include "array_functions.h"
 #include "block_tridiagonal.h"
 #include "camera.h"

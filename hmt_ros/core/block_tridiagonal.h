@@ -8,12 +8,12 @@
 
 namespace hmt {
 
-// Adds blocks (T, d, d) to the leading parts of the diagonal blocks (n, n). Of each block the upper
-// triangle is read.
+// Adds blocks (T, d, d) to the leading parts of the diagonal blocks (n, n). Only the upper triangle
+// of each block is read.
 inline void add_diagonal(const Matrix& columns, const Tables& blocks, Index n) {
   const Index times = blocks.size(), d = blocks.size(1);
   expect_shape("blocks", blocks, {times, d, d});
-  const bool may_fit = d <= n && (times == 0 || n <= columns.size());  // before they are multiplied
+  const bool may_fit = d <= n && (times == 0 || n <= columns.size());  // so that T n is safe
   expect(may_fit && times * n == columns.size(), "n", "at least d, and T n columns");
   expect(d <= columns.size(1), "columns", "a band as wide as the blocks");
   for (Index t = 0; t < times; ++t) {
@@ -57,7 +57,7 @@ HMT_WIDE inline void add_band_product(const Matrix& columns, const Table& x, con
   }
 }
 
-// Takes variables out of a system: their rows and columns become those of the unit matrix.
+// Removes variables from a system: their rows and columns become those of the identity.
 inline void hold(const Matrix& columns, const Places& held) {
   expect_range("held", held, 0, columns.size());
   expect(columns.size(1) > 0, "columns", "a diagonal");
@@ -68,13 +68,13 @@ inline void hold(const Matrix& columns, const Places& held) {
   }
 }
 
-// ---- Cholesky factors, in place. Read by rows i and columns c, the band is a matrix [i, c] whose
-// columns begin `width` numbers apart.
+// ---- Cholesky factors, in place. Indexed by rows i and columns c, the band is a matrix [i, c]
+// whose columns start `width` numbers apart.
 
-inline constexpr Index panel_columns = 2 * lanes;  // eliminated at a time
+inline constexpr Index panel_columns = 2 * lanes;  // number of columns eliminated together
 
-// Subtracts from R columns, in G groups of rows from i on, where the target is, the products of the
-// rows of a panel: target[i, r] -= sum over k of panel[k, r] panel[k, i].
+// Subtracts products of the rows of a panel from R columns of the target, in G groups of rows from
+// row i: target[i, r] -= sum over k of panel[k, r] panel[k, i].
 template <int R, int G>
 HMT_INLINE void subtract_products(double* target, Index width, const double* panel, Index stride,
                                   Index count, Index i) {
@@ -98,8 +98,8 @@ HMT_INLINE void subtract_products(double* target, Index width, const double* pan
   }
 }
 
-// The same of all `rows` of columns from the diagonal of the first on. A group may reach below the
-// rows, where the panel is 0, but neither above the diagonal nor out of the band.
+// The same for all `rows` of the columns, from the diagonal of the first column. A group may extend
+// below the rows, where the panel is 0, but not above the diagonal or outside the band.
 template <int R>
 HMT_INLINE void subtract_products(double* target, Index width, const double* panel, Index stride,
                                   Index count, Index rows) {
@@ -123,8 +123,8 @@ HMT_INLINE void subtract_products(double* target, Index width, const double* pan
   if (i < rows) subtract_some(i);
 }
 
-// Returns how many columns have a pivot that is positive and finite: all, or the matrix is not
-// positive definite. Columns of a block of n end with the next block: what is below is 0.
+// Returns the number of columns with a positive and finite pivot; if it is not all, the matrix is
+// not positive definite. Columns of a block of n end with the next block; below it they are 0.
 HMT_WIDE inline Index factorise_columns(const Matrix& columns, const Matrix& room, Index n) {
   const Index total = columns.size(), width = columns.size(1) - 1, stride = room.size(1);
   for (Index first = 0; first < total; first += panel_columns) {
@@ -160,6 +160,8 @@ inline Index factorise_blocks(const Matrix& columns, Index n) {
   const Scratch<double, 2> room(panel_columns, longest);
   return factorise_columns(columns, room.view(), n);
 }
+// Cholesky factor of a positive definite band, in place; returns the number of columns, or the
+// first column whose pivot is not positive.
 inline Index factorise_band(const Matrix& columns) {
   expect(columns.size(1) > 0, "columns", "a diagonal");
   return factorise_blocks(columns, std::max<Index>(columns.size(), 1));
@@ -170,7 +172,7 @@ inline void expect_vectors(const Matrix& columns, const Matrix& x) {
   expect_shape("x", x, {-1, columns.size()});
 }
 
-// L^-1 x of vectors x (S, T n), in place.
+// Replaces vectors x (S, T n) by L^-1 x.
 HMT_WIDE inline void solve_band_lower(const Matrix& columns, const Matrix& x) {
   expect_vectors(columns, x);
   const Index total = columns.size(), width = columns.size(1) - 1;
@@ -189,7 +191,7 @@ HMT_WIDE inline void solve_band_lower(const Matrix& columns, const Matrix& x) {
   }
 }
 
-// L'^-1 x of vectors x (S, T n), in place.
+// Replaces vectors x (S, T n) by L'^-1 x.
 HMT_WIDE inline void solve_band_transposed(const Matrix& columns, const Matrix& x) {
   expect_vectors(columns, x);
   const Index total = columns.size(), width = columns.size(1) - 1;
@@ -203,7 +205,7 @@ HMT_WIDE inline void solve_band_transposed(const Matrix& columns, const Matrix& 
   }
 }
 
-// L' x of vectors x (S, T n), in place.
+// Replaces vectors x (S, T n) by L' x.
 HMT_WIDE inline void multiply_band_transposed(const Matrix& columns, const Matrix& x) {
   expect_vectors(columns, x);
   const Index total = columns.size(), width = columns.size(1) - 1;
@@ -217,7 +219,7 @@ HMT_WIDE inline void multiply_band_transposed(const Matrix& columns, const Matri
   }
 }
 
-// The inverse of the lower triangle of rows, into rows that are 0.
+// Writes the inverse of the lower triangle of rows into rows that are 0.
 HMT_WIDE inline void invert_lower(matrices::Rows l, Index n, matrices::Rows result) {
   for (Index i = 0; i < n; ++i) {
     double* row = result[i];
@@ -227,8 +229,8 @@ HMT_WIDE inline void invert_lower(matrices::Rows l, Index n, matrices::Rows resu
   }
 }
 
-// The block at `place` on the diagonal of P^-1, (n, n), given the one after it; that of the last
-// place needs none. With the blocks B below L in this column, G = B L^-1 and C of the block after,
+// The diagonal block (n, n) of P^-1 at `place`, from the next diagonal block C of P^-1; the last
+// block needs none. L is the diagonal block of the factor, B the block below L, and G = B L^-1:
 //
 //     result = (L L')^-1 + G' C G = L'^-1 L^-1 + G' (C G)
 inline void invert_block(const Matrix& columns, Index place, const Table& after,

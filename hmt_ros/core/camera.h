@@ -11,10 +11,10 @@ struct Lens {
   std::array<double, 2> centre;  // cx, cy, px
   Index model;                   // -1: no distortion, 0: plumb_bob or rational, 1: equidistant
   std::array<double, 8> coefficients;
-  double near;  // least depth of a point that has a pixel, m
+  double near;  // minimum depth of a point that has a pixel, m
 };
 
-// Where a lens bends the ray through (a, b, 1), and the derivatives of u and v by a and b.
+// Distorted coordinates of the ray through (a, b, 1), and derivatives of u and v by a and b.
 struct Bent {
   double u, v, da, db, ea, eb;
 };
@@ -59,7 +59,7 @@ inline Bent bent_by(const Lens& lens, double a, double b) {
                            : bent_by_angle(lens.coefficients, a, b);
 }
 
-// Sets the pixel (2,) and its derivative (2, 3) by the point (a z, b z, z) whose ray is bent.
+// Sets the pixel (2,), and its derivative (2, 3) by the point (a z, b z, z), of a distorted ray.
 inline void set_pixel(const Lens& lens, const Bent& bent, double a, double b, double z,
                       double* pixel, double* projection) {
   const double fx = lens.focal[0] / z, fy = lens.focal[1] / z;
@@ -82,7 +82,7 @@ inline bool project(const Lens& lens, double x, double y, double z, double* pixe
   return true;
 }
 
-// Pixels (N, 2) of points (N, 3); no numbers behind the camera.
+// Pixels (N, 2) of points (N, 3); NaN behind the camera.
 inline void find_pixels(const Lens& lens, const Table& points, const Matrix& pixels) {
   expect_shape("points", points, {pixels.size(), 3});
   expect_shape("pixels", pixels, {-1, 2});
@@ -93,11 +93,11 @@ inline void find_pixels(const Lens& lens, const Table& points, const Matrix& pix
   }
 }
 
-// Error of a ray at which the inversion of a distortion ends, and its largest tangent.
+// Error of a ray at which the inversion of a distortion ends; maximum tangent of the ray.
 inline constexpr double close_ray = 1e-14, steepest_ray = 1e3;
 
-// Unit rays (N, 3) through pixels (N, 2). Newton's method inverts the distortion; where the lens
-// sends no ray to a pixel, the result is the one after the last iteration.
+// Unit rays (N, 3) through pixels (N, 2). Newton's method inverts the distortion; if no ray has the
+// pixel, the result is the ray after the last iteration.
 inline void find_rays(const Lens& lens, const Table& pixels, const Matrix& rays) {
   expect_shape("pixels", pixels, {rays.size(), 2});
   expect_shape("rays", rays, {-1, 3});
@@ -111,7 +111,7 @@ inline void find_rays(const Lens& lens, const Table& pixels, const Matrix& rays)
       if (std::abs(x) < close_ray && std::abs(y) < close_ray) break;
       double det = bent.da * bent.eb - bent.db * bent.ea;
       if (!(std::abs(det) > 1e-9)) det = 1.0;
-      // Where there is no such ray, iterations must not run away.
+      // Keep the iterations bounded if there is no such ray.
       a = between(a - (bent.eb * x - bent.db * y) / det, -steepest_ray, steepest_ray);
       b = between(b - (bent.da * y - bent.ea * x) / det, -steepest_ray, steepest_ray);
     }

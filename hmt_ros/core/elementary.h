@@ -1,10 +1,10 @@
-// Elementary functions with the same bytes on every processor.
+// Elementary functions with identical results on every processor.
 //
-// The C library picks its own implementation by processor. These use + - * / and the square root
-// alone, which IEEE 754 rounds in one way, in a fixed order, without fused products. Each result is
-// within one unit in the last place. No branches, so that loops over arrays become vectors; only
-// sines and cosines beyond `reduced_limit` leave the loop. Polynomials are minimax fits, their
-// errors below 2^-58 of the result.
+// The C library selects an implementation by processor. These functions only use + - * / and the
+// square root, for which IEEE 754 defines the rounding, in a fixed order and without fused
+// products. Each result is within one unit in the last place. There are no branches, so that loops
+// over arrays are vectorised; only sines and cosines beyond `reduced_limit` leave the loop.
+// Polynomials are minimax fits with errors below 2^-58 of the result.
 #pragma once
 
 #include <bit>
@@ -16,12 +16,13 @@ namespace hmt::elementary {
 
 using Bits = std::uint64_t;
 
-// The unevaluated sum of two numbers, the second at most half a unit of the first.
+// The unevaluated sum of two numbers; the second is at most half a unit in the last place of the
+// first.
 struct Pair {
   double high, low;
 };
 
-inline constexpr double rounder = 0x1.8p52;  // added and taken off: rounds to an integer
+inline constexpr double rounder = 0x1.8p52;  // adding and subtracting it rounds to an integer
 inline constexpr double least_normal = 0x1p-1022;
 inline constexpr double reduced_limit = 1e6;  // rad
 inline constexpr double root_half_up = 0x1.6a09e667f3bcdp-1;
@@ -31,12 +32,12 @@ HMT_INLINE double from_bits(Bits bits) { return std::bit_cast<double>(bits); }
 HMT_INLINE double absolute(double x) { return from_bits(bits_of(x) & ~Bits{0} >> 1); }
 HMT_INLINE Bits sign_bit(double x) { return bits_of(x) & Bits{1} << 63; }
 HMT_INLINE double with_sign(double x, Bits sign) { return from_bits(bits_of(x) ^ sign); }
-// One of two numbers; the mask has all bits or none.
+// Selects one of two numbers; the mask has all bits or none.
 HMT_INLINE double either(Bits mask, double yes, double no) {
   return from_bits((bits_of(yes) & mask) | (bits_of(no) & ~mask));
 }
 
-HMT_INLINE Pair two_sum(double a, double b) {  // exact, as the next two
+HMT_INLINE Pair two_sum(double a, double b) {  // exact, like the next two functions
   const double sum = a + b, part = sum - a;
   return {sum, (a - (sum - part)) + (b - part)};
 }
@@ -78,10 +79,10 @@ HMT_INLINE double polynomial(double x, double first, More... more) {
 
 struct Reduced {
   Pair rest;
-  Bits quadrant;  // its last two bits
+  Bits quadrant;  // only the last two bits are valid
 };
 
-// Pieces of pi/2 of 33 bits, of which 2^20 times each is exact.
+// Pieces of pi/2 with 33 bits, so that products with integers up to 2^20 are exact.
 HMT_INLINE Reduced reduced(double x) {
   const double shifted = x * 0x1.45f306dc9c883p-1 + rounder, n = shifted - rounder;
   const Pair first = two_sum(x - n * 0x1.921fb544p+0, -(n * 0x1.0b4611a6p-34));
@@ -90,7 +91,7 @@ HMT_INLINE Reduced reduced(double x) {
   return {quick_two_sum(second.high, low), bits_of(shifted)};
 }
 
-// Any x from 1 on: the bits of 2/pi from which its multiple by x depends on, 256 of them.
+// Reduction of any |x| >= 1, with the 256 bits of 2/pi that determine x 2/pi mod 4.
 inline Reduced reduced_far(double x) {
   __extension__ using Wide = unsigned __int128;
   static constexpr Bits two_over_pi[] = {0x0000000000000000, 0xa2f9836e4e441529,
@@ -262,7 +263,7 @@ HMT_INLINE double log1p(double x) {
   return either(-Bits{x == 0.0}, x, log_ends(u.high, inside));
 }
 
-// The logarithm with an error below 2^-65 of it, for powers.
+// The logarithm with a relative error below 2^-65, for powers.
 HMT_INLINE Pair log_pair(double x) {
   const Normal at = normal(x);
   const double g = at.f - 1.0;
@@ -282,9 +283,9 @@ HMT_INLINE Pair log_pair(double x) {
   const Pair whole = two_sum(at.n * 0x1.62e42fefp-1, 2.0 * fraction.high);
   return quick_two_sum(whole.high, whole.low + (at.n * 0x1.473de6af278edp-34 + 2.0 * fraction.low));
 }
-// x^y for x >= 0; no number for x < 0, unless y is 0.
+// x^y for x >= 0; NaN for x < 0, unless y is 0.
 HMT_INLINE double pow(double x, double y) {
-  constexpr double most_power = 0x1p64;  // more changes no result
+  constexpr double most_power = 0x1p64;  // larger exponents give the same result
   double power = y > most_power ? most_power : y;
   power = power < -most_power ? -most_power : power;
   const Pair log = log_pair(x);
@@ -299,11 +300,11 @@ HMT_INLINE double pow(double x, double y) {
 
 // ---- inverse functions
 
-// The angle of the point (x, y), both at least 0; turned: that of (-x, y).
+// The angle of the point (x, y) with x, y >= 0; if turned, the angle of (-x, y).
 HMT_INLINE double angle_of(Pair y, Pair x, bool turned) {
   const bool steep = y.high > x.high;
   Pair less = steep ? x : y, more = steep ? y : x;
-  // The larger one becomes 1 to 4, so that products neither overflow nor vanish.
+  // Scale the larger one to 1 to 4, so that products neither overflow nor vanish.
   const double scale =
       more.high >= 0x1p1022
           ? 0x1p-1022
@@ -325,7 +326,7 @@ HMT_INLINE double angle_of(Pair y, Pair x, bool turned) {
                            -0.06666226711482101, 0.05877021423316261, -0.05218402328664302,
                            0.04503542075886042, -0.03347430225823904, 0.015195006964371408) +
       (low - z * low);
-  // The angle is that of t, or its opposite, and a number of eighths of a turn.
+  // The angle is plus or minus the angle of t, plus a multiple of an eighth of a turn.
   const Bits flip = (Bits{steep} ^ Bits{turned}) << 63;
   double eighths = middle ? 1.0 : 0.0;
   eighths = steep ? 2.0 - eighths : eighths;
@@ -361,7 +362,7 @@ HMT_INLINE double hypot(double x, double y) {
   return a == infinity || b == infinity ? infinity : result;
 }
 
-// ---- arrays, in vectors: several times as fast as one number after the other
+// ---- arrays, vectorised: several times as fast as number by number
 
 template <double (*f)(double)>
 HMT_WIDE void map(const double* x, double* __restrict result, Index count) {

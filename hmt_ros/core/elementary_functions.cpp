@@ -1,4 +1,4 @@
-// The elementary functions for arrays, under the names of numpy's.
+// The elementary functions for arrays, with numpy's names.
 #include "array_functions.h"
 #include "elementary.h"
 #include "ufunc.h"

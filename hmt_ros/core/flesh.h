@@ -63,9 +63,9 @@ inline void fill_rings(const Superquadrics& parts, const Places& ring_parts, con
   }
 }
 
-// Fills points and outward unit normals (P, G + 2, 3) of each part: at G heights and angles, whose
-// cosines and sines are given, and the two tips. Equal heights one after the other, and angles that
-// come back after as many, are raised to their powers once.
+// Fills points and outward unit normals (P, G + 2, 3) of each part: at G heights and angles, given
+// by cosines and sines, and at the two tips. Powers are computed once for consecutive equal heights
+// and for repeated angles.
 inline void fill_surface(const Superquadrics& parts, const Numbers& heights, const Numbers& cosines,
                          const Numbers& sines, const Tensor& points, const Tensor& normals) {
   const Index count = heights.size();

@@ -3,7 +3,7 @@
 //
 //     E(x) = w / Q sum_q rho(|u_q(x) - p_q - f(p_q)| / (sigma + 0.15 |f(p_q)|))
 //
-// Q points of the surface were seen at pixels p_q of the image before; the pose x moves them to
+// Q points of the surface were seen at pixels p_q of the previous image; the pose x moves them to
 // u_q(x), and f is the flow.
 #pragma once
 
@@ -13,26 +13,26 @@
 
 namespace hmt {
 
-// Standard deviation of the flow, px, and its further error, as a share of the displacement.
+// Standard deviation of the flow, px, and additional error relative to the displacement.
 inline constexpr double flow_sigma = 1.5, flow_share = 0.15;
 // Width of the Geman-McClure kernel, in standard deviations.
 inline constexpr double flow_scale = 2.0;
 
 struct FlowTerm {
-  SurfacePoints points;  // of K poses in the image before, one for each problem
-  ImageMap flow;         // from that image to this one
+  SurfacePoints points;  // of K poses in the previous image, one for each problem
+  ImageMap flow;         // from the previous image to this one
   double weight;         // w, number of independent measurements; 0: off
 
   void check() const {
     if (weight > 0.0) expect_shape("flow.values", flow.values, {2, -1, -1});
   }
-  // Points must be of segments that a body of so many has.
+  // Checks that points lie on existing segments.
   void check_segments(Index count) const {
     expect_range("points.segments", points.segments, 0, count);
   }
 };
 
-// Adds the energy, and residuals to the sums, of a pose of one problem, a row of the points.
+// Adds the energy of a pose, and residuals to the sums; the problem is a row of the points.
 inline void add_flow(const FlowTerm& term, const Lens& lens, Index row, const Frames& frames,
                      const Sums& sums, double& value) {
   expect(0 <= row && row < term.points.counts.size(), "rows", "a row of the points");
@@ -52,7 +52,7 @@ inline void add_flow(const FlowTerm& term, const Lens& lens, Index row, const Fr
     const double u = pixels(q, 0), v = pixels(q, 1);
     const double fu = sample(term.flow, 0, u, v).value, fv = sample(term.flow, 1, u, v).value;
     if (std::isnan(fu)) {
-      // Somebody else hides it: it has the usual cost, wherever it is.
+      // Another person hides the point: it has a typical cost at any position.
       value += geman_mcclure(1.0, flow_scale, each).value;
       continue;
     }

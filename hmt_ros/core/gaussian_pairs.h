@@ -9,13 +9,13 @@
 
 namespace hmt {
 
-// Pairs whose covariances are factorised side by side, and one number of each.
+// Number of pairs whose covariances are factorised side by side; one number of each pair.
 inline constexpr int pair_lanes = 4;
 using PairLanes [[gnu::vector_size(pair_lanes * sizeof(double))]] = double;
 
-// Cholesky factors (d, d), with inverses on the diagonal, in place of the lower triangles of
-// covariances, and forward substitution of row d, which becomes the whitened offset. Rows are
-// worked on two columns at a time.
+// Replaces the lower triangles of covariances (d, d) by Cholesky factors, with inverses on the
+// diagonal, and the offset in row d by the whitened offset (forward substitution). Two columns are
+// processed at a time.
 HMT_WIDE inline void whiten(PairLanes* factor, Index d) {
   for (Index i = 0; i <= d; ++i) {
     PairLanes* row = factor + i * d;

@@ -1,11 +1,11 @@
-// Capsules inside of larger ones; see hmt_ros/body/keep_out.py.
+// Capsules inside larger ones; see hmt_ros/body/keep_out.py.
 #pragma once
 
 #include "small_matrix.h"
 
 namespace hmt {
 
-// The axis of a capsule, a segment of a line.
+// The axis of a capsule, a line segment.
 struct Axis {
   double start[3], way[3];  // way: from start to end
   double squared;
@@ -16,7 +16,7 @@ struct Axis {
         squared(most(dot(way, way), 1e-18)) {}
 };
 
-// Squared distances of a group of points from an axis; by coordinate, a stride apart.
+// Squared distances of a group of points from an axis; coordinates are a stride apart.
 HMT_INLINE void square_distances(const Axis& axis, const double* points, Index stride,
                                  Group<double>& squares) {
   const auto at = [&](int k) {
@@ -32,7 +32,7 @@ HMT_INLINE void square_distances(const Axis& axis, const double* points, Index s
   squares = dx * dx + dy * dy + dz * dz;
 }
 
-// Marks by 0 which points, whole groups, are not outside of a capsule; whether one still is.
+// Marks points inside a capsule by 0, in whole groups; returns whether a point is still outside.
 HMT_WIDE inline bool leave_outside(Axis axis, double radius, const double* points, Index stride,
                                    double* outside) {
   const Group<double> zero{}, limit = zero + radius * radius;
@@ -46,8 +46,8 @@ HMT_WIDE inline bool leave_outside(Axis axis, double radius, const double* point
   return rest[0] + rest[1] + rest[2] + rest[3] > 0.0;
 }
 
-// Lists which balls from `first` on touch a capsule; those whose size is no number do not. Their
-// middles are whole groups. Returns how many do.
+// Lists the balls from `first` on that touch a capsule; balls with a size of NaN do not. Centres
+// come in whole groups. Returns the number of listed balls.
 HMT_WIDE inline Index find_touched(Axis axis, double radius, const Matrix& middles,
                                    const double* sizes, Index first, Index* touched) {
   Index count = 0;
@@ -68,8 +68,8 @@ inline Index in_whole_groups(Index count) {
   return (count + group_size - 1) / group_size * group_size;
 }
 
-// Points around three places of the axis of a capsule, by a ring (2, A) of cosines and sines, and
-// beyond its ends; by coordinate (3, stride).
+// Points (3, stride) on the surface of a capsule: around three places of the axis, by a ring (2, A)
+// of cosines and sines, and at both tips.
 inline void fill_around(const Axis& axis, const double* end, double radius, const Table& ring,
                         double* points, Index stride) {
   const double length = std::sqrt(dot(axis.way, axis.way));
@@ -98,8 +98,8 @@ inline void fill_around(const Axis& axis, const double* end, double radius, cons
   }
 }
 
-// Fills whether each of N capsules, largest first, has points on its surface, by a ring (2, A) of
-// cosines and sines around its axis, outside of those before.
+// Fills whether each of N capsules, largest first, has surface points outside all previous
+// capsules. Surface points are given by a ring (2, A) of cosines and sines around the axis.
 inline void find_not_held(const Table& starts, const Table& ends, const Numbers& radii,
                           const Table& ring, const Array<bool, 1>& kept) {
   const Index n = radii.size(), count = 3 * ring.size(1) + 2;
@@ -110,7 +110,7 @@ inline void find_not_held(const Table& starts, const Table& ends, const Numbers&
   kept.fill(false);
   const Index stride = in_whole_groups(count), whole = in_whole_groups(n);
   const Scratch<double, 2> outside(n, stride), points(n, 3 * stride);
-  // A ball around each: most pairs are far apart.
+  // Compare enclosing balls first, because most pairs are far apart.
   const Scratch<double, 2> middles(3, whole);
   const Scratch<double, 1> sizes(whole);
   const Scratch<Index, 1> touched(whole);

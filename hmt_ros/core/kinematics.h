@@ -7,8 +7,8 @@ namespace hmt {
 
 // The skeleton: S segments, d degrees of freedom.
 struct Placing {
-  Places parents;     // (S,) segment above; -1: none
-  Places first_dofs;  // (S + 1,) the degrees of freedom of segment s start here
+  Places parents;     // (S,) parent of each segment; -1: none
+  Places first_dofs;  // (S + 1,) index of the first degree of freedom of each segment
   Places dof_axes;    // (d,) 0, 1 or 2
   Mask dof_is_rotation;
   Tables mounts;  // (S, 3, 3) of the segments on their parents
@@ -44,15 +44,15 @@ inline void expect_frames(Index segments, Index d, const Tables& columns, const 
   expect_shape("dof_origins", dof_origins, {d, 3});
 }
 
-// Where a pose is placed, or several side by side in numbers of the type T: columns (S, 3, 3),
-// origins (S, 3), and of the degrees of freedom axes and points on them (d, 3).
+// Results for a pose, or for several side by side in numbers of type T: columns (S, 3, 3) and
+// origins (S, 3) of the segments, axes of the degrees of freedom and points on these axes (d, 3).
 template <class T>
 struct FramesOf {
   T *columns, *origins, *axes, *dof_origins;
 };
 
-// Places segment s of a pose (d,) whose parent is placed; see `place_pose`. Sine and cosine of an
-// angle are those that `turn_of` gives.
+// Places segment s of a pose (d,) whose parent is placed; see `place_pose`. `turn_of` gives the
+// sine and cosine of an angle.
 template <class T, class TurnOf>
 HMT_INLINE void place_one(const Placing& tree, Index s, const T* pose, const TurnOf& turn_of,
                           const FramesOf<T>& placed) {
@@ -106,7 +106,8 @@ inline void place_segment(const Placing& tree, Index s, const Numbers& pose, con
 }
 
 // Fills the frames of one pose (d,): columns (S, 3, 3), origins (S, 3), and for each degree of
-// freedom its unit vector and a point on the axis of a rotation (d, 3), which translations leave.
+// freedom its unit vector and a point on the axis of a rotation (d, 3); translations do not set the
+// point.
 inline void place_pose(const Placing& tree, const Numbers& pose, const Tensor& columns,
                        const Matrix& origins, const Matrix& axes, const Matrix& dof_origins) {
   for (Index s = 0; s < tree.segments(); ++s) {
@@ -143,10 +144,10 @@ inline void place_poses(const Placing& tree, const Table& poses, const Array<dou
   }
 }
 
-// Poses are placed so many side by side.
+// Number of poses that are placed side by side.
 inline constexpr Index abreast = 8;
 typedef double Abreast __attribute__((vector_size(abreast * sizeof(double))));
-// Room for such poses.
+// Room for poses side by side.
 struct AbreastRoom {
   Scratch<Abreast, 2> pose, sines, cosines, columns, origins, axes, dof_origins;
   AbreastRoom(Index s, Index d)
@@ -159,7 +160,7 @@ struct AbreastRoom {
         dof_origins(d, 3) {}
 };
 
-// Places points, given by segments (P,) and by places there (P, 3), of up to `abreast` poses (n,
+// Places points, given by segments (P,) and local positions (P, 3), at up to `abreast` poses (n,
 // d).
 HMT_WIDE inline void place_abreast(const Placing& tree, const Table& poses, const Places& segments,
                                    const Table& local, const AbreastRoom& room,
@@ -199,8 +200,8 @@ HMT_WIDE inline void place_abreast(const Placing& tree, const Table& poses, cons
   }
 }
 
-// Fills the points (N, P, 3), given by segments (P,) and by places there (P, 3), of poses (N, d);
-// relative ones less the first.
+// Fills the points (N, P, 3), given by segments (P,) and local positions (P, 3), at poses (N, d);
+// if `relative`, minus the first point.
 inline void place_points(const Placing& tree, const Table& poses, const Places& segments,
                          const Table& local, bool relative, const Tensor& points) {
   const Index n = poses.size(), s = tree.segments(), d = tree.dimension(), count = segments.size();
@@ -279,8 +280,8 @@ inline void derive_points(const Array<const bool, 2>& moves, const Mask& is_rota
   }
 }
 
-// Fills the derivatives (N, S, 3, L) of the origins by the lengths: of those on the segments, the
-// basis (S, 3, L), and of the parents. Columns are (N, S, 3, 3).
+// Fills the derivatives (N, S, 3, L) of the origins by the lengths, from the basis (S, 3, L) of the
+// offsets and the origins of the parents. Columns are (N, S, 3, 3).
 inline void lift_origins(const Places& parents, const Tables& basis,
                          const Array<const double, 4>& columns, const Array<double, 4>& result) {
   const Index count = parents.size(), lengths = basis.size(2), poses = columns.size();

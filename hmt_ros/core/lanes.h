@@ -1,4 +1,5 @@
-// Numbers side by side in vector registers, and sums of them in an order that no register changes.
+// Numbers side by side in vector registers, and sums in an order that is the same for all
+// registers.
 #pragma once
 
 #include "arrays.h"
@@ -6,7 +7,7 @@
 
 namespace hmt {
 
-// So many numbers are computed side by side, whatever the width of the registers.
+// Count of numbers that are computed side by side, for registers of any width.
 inline constexpr Index lanes = 8;
 
 inline Index in_whole_lanes(Index count) { return (count + lanes - 1) / lanes * lanes; }
@@ -16,7 +17,7 @@ inline double sum_lanes(const double* s) {
   return ((s[0] + s[4]) + (s[2] + s[6])) + ((s[1] + s[5]) + (s[3] + s[7]));
 }
 
-// Sum of x[i] over i < count, which must be whole lanes: of partial sums s[i % lanes].
+// Sum of x[i] over i < count, a multiple of `lanes`, from partial sums s[i % lanes].
 inline double sum_of(const double* x, Index count) {
   double sums[lanes] = {};
   for (Index i = 0; i < count; i += lanes) {
@@ -26,7 +27,7 @@ inline double sum_of(const double* x, Index count) {
   return sum_lanes(sums);
 }
 
-// Numbers in groups of 32 bytes: compilers split larger ones badly where registers are not as wide.
+// Numbers in groups of 32 bytes, because compilers split larger groups badly for narrow registers.
 template <class T>
 struct Lanes {
   typedef T Group __attribute__((vector_size(32), aligned(alignof(T)), may_alias));
@@ -36,8 +37,8 @@ template <class T>
 using Group = typename Lanes<T>::Group;
 inline constexpr Index group_size = Lanes<double>::count;
 
-// Sum of x[i] y[i] over i < n: of partial sums by i % (2 count), which are added in pairs, and
-// then, one after the other, of the products that are left beyond whole pairs of groups.
+// Sum of x[i] y[i] over i < n: partial sums by i % (2 count) are added in pairs; then the products
+// beyond whole pairs of groups are added one by one.
 template <class T>
 HMT_INLINE T dot(const T* x, const T* y, Index n) {
   constexpr Index count = Lanes<T>::count;

@@ -13,7 +13,7 @@ HMT_WIDE inline double exponentials(double* x, double largest, Index count) {
   return sum;
 }
 
-// Of what lies in `x`, which is overwritten.
+// log sum exp of the numbers in `x`, which are overwritten.
 HMT_WIDE inline double log_sum_exp(double* x, Index count) {
   double largest = -infinity;
   for (Index i = 0; i < count; ++i) {
@@ -24,7 +24,7 @@ HMT_WIDE inline double log_sum_exp(double* x, Index count) {
   return largest + elementary::log(exponentials(x, largest, count));
 }
 HMT_INLINE double log_add_exp(double a, double b) {
-  if (a == b) return a + 0x1.62e42fefa39efp-1;  // log 2; also where both are infinite
+  if (a == b) return a + 0x1.62e42fefa39efp-1;  // log 2; also if both are infinite
   const double larger = a > b ? a : b;
   return larger + elementary::log1p(elementary::exp(-std::abs(a - b)));
 }

@@ -1,6 +1,6 @@
 // The linear algebra as generalised ufuncs; hmt_ros/inference/linear_algebra.py calls them.
 //
-// Where a matrix has no result, they fill it with no numbers and report what numpy calls invalid.
+// If a matrix has no result, they fill it with NaN and report an invalid operation to numpy.
 #include "array_functions.h"
 #include "log_sum_exp.h"
 #include "small_matrix.h"
@@ -153,7 +153,7 @@ class Items {
   Items(char** pointers, const Index* counts, const Index* strides, int arrays)
       : pointers_(pointers), count_(counts[0]), outer_(strides), inner_(strides + arrays) {}
   Index size() const { return count_; }
-  // An array's part of item i, whose own strides begin at place `at`.
+  // The part of an array for item i; the strides of its own axes start at index `at`.
   Strided<double> matrix(int array, Index i, int at) const {
     return {pointers_[array] + i * outer_[array], inner_[at], inner_[at + 1]};
   }
@@ -202,7 +202,7 @@ void cholesky_loop(char** pointers, const Index* counts, const Index* strides, v
   bool all = true;
   for (Index i = 0; i < items.size(); ++i) {
     const Strided<double> given = items.matrix(0, i, 0), result = items.matrix(1, i, 2);
-    read({given.data, given.column, given.row}, n, n, rows);  // its lower triangle, as numpy does
+    read({given.data, given.column, given.row}, n, n, rows);  // the lower triangle, as in numpy
     const bool good = factorise(rows, n);
     all = all && good;
     for (Index j = 0; j < n; ++j) {
@@ -251,7 +251,7 @@ void inverse_loop(char** pointers, const Index* counts, const Index* strides, vo
   report_only(all ? 0 : FE_INVALID);
 }
 
-// (n,n)->(),(): the determinant, and the logarithm of its size.
+// (n,n)->(),(): the determinant, and the logarithm of its absolute value.
 void determinant_loop(char** pointers, const Index* counts, const Index* strides, void*) {
   const Items items(pointers, counts, strides, 3);
   const Index n = counts[1];
@@ -268,8 +268,8 @@ void determinant_loop(char** pointers, const Index* counts, const Index* strides
   report_only(0);
 }
 
-// Scales rows by a power of two, so that their largest number is near to 1; returns its inverse, or
-// no number if one is not finite.
+// Scales rows by a power of two, so that their largest number is near 1; returns the inverse power,
+// or NaN if a number is not finite.
 double scale(Rows rows, Index m, Index n) {
   double largest = 0.0;
   for (Index i = 0; i < m; ++i) {
@@ -286,7 +286,7 @@ double scale(Rows rows, Index m, Index n) {
   return 1.0 / factor;
 }
 
-// The places of values in the order of their size.
+// Indices that sort values by size.
 void sort_places(const double* values, Index n, Index* places, bool falling) {
   for (Index i = 0; i < n; ++i) places[i] = i;
   std::stable_sort(places, places + n, [&](Index a, Index b) {
@@ -309,7 +309,7 @@ void eigen_loop(char** pointers, const Index* counts, const Index* strides, void
   bool all = true;
   for (Index i = 0; n > 0 && i < items.size(); ++i) {
     read(items.matrix(0, i, 0), n, n, rows);
-    for (Index j = 0; j < n; ++j) {  // its lower triangle, as numpy does
+    for (Index j = 0; j < n; ++j) {  // the lower triangle, as in numpy
       for (Index k = 0; k < j; ++k) rows[k][j] = rows[j][k];
     }
     const double unit = scale(rows, n, n);
@@ -335,8 +335,8 @@ void eigen_loop(char** pointers, const Index* counts, const Index* strides, void
   report_only(all ? 0 : FE_INVALID);
 }
 
-// (m,n)->(m,n),(n),(n,n): U, the singular values and V, for m >= n. A column of U of a singular
-// value 0 is 0.
+// (m,n)->(m,n),(n),(n,n): U, the singular values and V, for m >= n. Columns of U are 0 for singular
+// values of 0.
 void svd_loop(char** pointers, const Index* counts, const Index* strides, void*) {
   const Items items(pointers, counts, strides, 4);
   const Index m = counts[1], n = counts[2];
@@ -393,7 +393,7 @@ void exponential_loop(char** pointers, const Index* counts, const Index* strides
       64764752532480000, 32382376266240000, 7771770303897600, 1187353796428800, 129060195264000,
       10559470521600, 670442572800, 33522128640, 1323241920, 40840800, 960960, 16380, 182, 1};
   // clang-format on
-  constexpr double theta = 5.371920351148152;  // the largest norm of full accuracy
+  constexpr double theta = 5.371920351148152;  // largest norm with full accuracy
   const Items items(pointers, counts, strides, 2);
   const Index n = counts[1], width = in_whole_lanes(n), area = n * width;
   const Scratch<double, 2> powers(4, area), room(2, 2 * area);

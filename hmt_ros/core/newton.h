@@ -7,8 +7,8 @@
 namespace hmt {
 
 inline constexpr double damping_limit = 1e12;
-inline constexpr double least_factor = 1.0 / 3.0;  // a damping shrinks by at most this factor
-inline constexpr double least_ratio = 1e-3;  // of the predicted decrease, for a step that is taken
+inline constexpr double least_factor = 1.0 / 3.0;  // minimum factor on a damping in a step
+inline constexpr double least_ratio = 1e-3;        // minimum share of the predicted decrease
 
 // Decrease that the quadratic model predicts for a step (d,); `curve` (d,) becomes H step.
 inline double predicted_decrease(const Numbers& gradient, const Table& hessian, const Numbers& step,
@@ -36,8 +36,8 @@ class BoxStep {
   explicit BoxStep(Index d)
       : bound_(d), solution_(d), curve_(d), best_(d), factor_(d, d), free_(d) {}
 
-  // Sets the step (d,) and returns the decrease that the undamped model predicts. Where the limits
-  // have spoilt a step so that it gains nothing, steepest descent stands in.
+  // Sets the step (d,) and returns the decrease that the undamped model predicts. If the limits
+  // leave a step without gain, steepest descent replaces it.
   HMT_WIDE double take(const Numbers& gradient, const Table& hessian, const Numbers& low,
                        const Numbers& high, double damping, const Numbers& metric,
                        const Vector& step) {
@@ -71,7 +71,8 @@ class BoxStep {
         if (!bound_[i]) free_[count++] = i;
       }
       while (!solve(gradient, hessian, shift, metric, count, step)) {
-        // Not positive definite: the least shift that Gershgorin asks for is far too careful.
+        // Not positive definite: increase the damping in steps, because Gershgorin's bound is too
+        // large.
         const double more = most(4.0 * shift, least_shift(hessian, metric));
         if (shift > damping_limit || !(more > shift)) break;
         shift = more;
@@ -109,8 +110,8 @@ class BoxStep {
     step.copy_from(best_);
   }
 
-  // Solves the damped model for the free variables, the bound ones at their steps, by a Cholesky
-  // factorisation that runs along rows; false where the matrix is not positive definite.
+  // Solves the damped model for the free variables, with bound variables fixed at their steps, by a
+  // row-wise Cholesky factorisation; false if the matrix is not positive definite.
   bool solve(const Numbers& gradient, const Table& hessian, double shift, const Numbers& metric,
              Index count, const Vector& step) {
     for (Index a = 0; a < count; ++a) {
@@ -123,7 +124,7 @@ class BoxStep {
       }
       solution_[a] = right;
     }
-    // Two rows at a time, each one's part after the other's.
+    // Eliminate two rows at a time, one after the other.
     for (Index a = 0; a < count; a += 2) {
       const Index b = a + 1;
       const double *row = factor_[a].data, *next = row;
@@ -150,7 +151,7 @@ class BoxStep {
     return true;
   }
 
-  // Divides row a of the factor by the root of its pivot; false where that is not positive.
+  // Divides row a of the factor by the root of its pivot; false if the pivot is not positive.
   bool scale_row(Index a, Index count) {
     double* row = factor_[a].data;
     if (!(row[a] > 0.0)) return false;
@@ -159,7 +160,7 @@ class BoxStep {
     solution_[a] *= root;
     return true;
   }
-  // Subtracts from row b what row a says of it.
+  // Subtracts the product with row a from row b.
   void subtract(const double* row, Index a, Index b, Index count) {
     solution_[b] -= row[b] * solution_[a];
     add_scaled(-row[b], row + b, factor_[b].data + b, count - b);
@@ -195,8 +196,8 @@ class BoxStep {
 
 // Steps from the points of some problems, and the decrease that the undamped model predicts.
 //
-// x, gradient, lower, upper: (N, d). hessian: (N, d, d). lam: (N,) damping; more where the Hessian
-// is not positive definite. metric: (d,) diagonal of W. rows: (n,) the problems.
+// x, gradient, lower, upper: (N, d). hessian: (N, d, d). lam: (N,) damping; increased if the
+// Hessian is not positive definite. metric: (d,) diagonal of W. rows: (n,) the problems.
 // step, predicted: (n, d), (n,) become the steps and the decreases.
 void box_steps(const Table& x, const Table& gradient, const Tables& hessian, const Table& lower,
                const Table& upper, const Numbers& lam, const Numbers& metric, const Places& rows,

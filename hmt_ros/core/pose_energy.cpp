@@ -7,11 +7,11 @@ namespace hmt {
 
 namespace {
 
-// Working space for one pose after the other.
+// Working space, reused for all poses.
 class PoseEnergy {
  public:
-  // `point` (d,) holds the values of the variables that are not free (f,); `apart`: whether cues
-  // are summed apart.
+  // `point` (d,) has the values of variables that are not in `free` (f,); `apart`: whether cues are
+  // summed separately.
   PoseEnergy(const Terms& terms, const Numbers& point, const Places& free, bool apart)
       : terms_(terms),
         free_(free),
@@ -37,8 +37,8 @@ class PoseEnergy {
   const Tensor& hessians() const { return hessians_; }
 
   // Energy at x (f,) of point `number` of a call, which belongs to the problem `row`; slope (f,)
-  // and curve (f, f) become its derivatives, where they are wanted. `exact`: the Hessian of the
-  // prior is the exact one.
+  // and curve (f, f) become its derivatives if wanted. `exact`: whether the Hessian of the prior is
+  // exact.
   double at(Index number, Index row, const Numbers& x, bool exact, bool wanted, const Vector& slope,
             const Matrix& curve) {
     const Index f = free_.size();
@@ -69,7 +69,7 @@ class PoseEnergy {
   }
 
  private:
-  // Energy of the pose without the motion; derivatives become those by the pose.
+  // Energy of the pose without the motion prior; sets derivatives by the pose.
   double add_terms(Index number, Index row, bool exact, bool wanted) {
     const Index keypoints = std::min<Index>(1, cues_ - 1), others = cues_ - 1;
     const Tensor& columns = view_.columns;
@@ -78,7 +78,7 @@ class PoseEnergy {
     const Matrix curve = hessians_[others];
     const Sums sums = wanted ? Sums{segments_.view(), {}} : Sums{};
     values_.fill(0.0);
-    if (wanted) {  // the prior sets those of the others
+    if (wanted) {  // the prior sets those of the last cue
       gradients_.view().rows(0, others).fill(0.0);
       hessians_.view().rows(0, others).fill(0.0);
     }
@@ -120,14 +120,14 @@ class PoseEnergy {
     return total;
   }
 
-  // Takes the sums over the segments to the derivatives of a cue, and reset them.
+  // Converts the sums over segments to derivatives of a cue, and resets the sums.
   void assemble(Index cue) {
     assemble_pose(terms_.model.tree, axes_, dof_origins_, segments_, gradients_[cue],
                   hessians_[cue]);
     segments_.fill({});
   }
 
-  // Energy of the motion at x (f,); adds its derivatives where they are wanted.
+  // Energy of the motion prior at x (f,); adds its derivatives if wanted.
   double add_motion(const Numbers& centre, const Table& precision, const Numbers& x, bool wanted,
                     const Vector& slope, const Matrix& curve) {
     const Index f = x.size();
@@ -172,8 +172,8 @@ class PoseEnergy {
   Scratch<double, 1> pulled_;
 };
 
-// Sets the next trial from a step, between the limits: rounding must not leave a variable a hair
-// away from its limit.
+// Sets the next trial from a step, within the limits. A variable that reaches a limit is set to
+// exactly this limit, despite rounding.
 void try_step(const Numbers& x, const Numbers& step, const Numbers& low, const Numbers& high,
               const Table& limits, const Vector& trial) {
   for (Index i = 0; i < x.size(); ++i) {
@@ -322,7 +322,7 @@ void record_residuals(const Model& model, const TermInputs& inputs,
   }
 }
 
-// ---- Parts of the energy for Python, here so that they are compiled once.
+// ---- Parts of the energy for Python, in this file so that they are compiled once.
 
 void box_steps(const Table& x, const Table& gradient, const Tables& hessian, const Table& lower,
                const Table& upper, const Numbers& lam, const Numbers& metric, const Places& rows,

@@ -20,23 +20,23 @@
 
 namespace hmt {
 
-// The terms; one that is not there counts 0. R rows of the motion: one a problem, or one for all.
+// The terms; missing terms add 0. The motion prior has R rows: one per problem, or one for all.
 struct Terms {
   Placing placing;
   Model model;
   TermInputs inputs;  // of the terms of the image
-  bool image;         // whether one of these is on
-  bool contour;       // whether one that is on needs the contour
+  bool image;         // whether any of these is on
+  bool contour;       // whether any active term needs the contour
   KeypointInputs keypoints;
   PriorModel prior;
   Overlaps overlaps;
   GroundConstants ground;
   FlowTerm flow;
-  Table centres;      // (R, f) of the motion prior; no rows: none
+  Table centres;      // (R, f) means of the motion prior; no rows: no prior
   Tables precisions;  // (R, f, f)
-  double tails;       // degrees of freedom of the motion; 0: it is Gaussian
+  double tails;       // degrees of freedom of the motion prior; 0: Gaussian
 
-  // Number of problems that the terms know; they know any where each has one row for all.
+  // Number of problems of the terms; unlimited if each term has one row for all.
   Index problems() const {
     Index count = std::numeric_limits<Index>::max();
     if (flow.weight > 0.0) count = std::min(count, flow.points.counts.size());
@@ -59,26 +59,26 @@ struct Terms {
 
 // Settings of the minimiser; see `minimise` of hmt_ros/inference/bounded_newton.py.
 struct Descent {
-  Index most;  // evaluations per problem after the first one
+  Index most;  // maximum evaluations per problem after the first
   double damping, tolerance;
   Numbers scale;  // (d,) length of a moderate step of each variable: W = diag(scale^-2)
 };
 
-// Energies (n, 3) and Hessians (n, 3, d, d) of image, keypoints and all other terms; of no point:
-// not wanted. They are those of the last evaluation, all variables are free, and Hessians only
-// where derivatives are.
+// Energies (n, 3) and Hessians (n, 3, d, d) of image, keypoints and all other terms; empty if not
+// wanted. They are from the last evaluation. All variables must be free, and Hessians need
+// derivatives.
 using ByCue = std::tuple<Matrix, Array<double, 4>>;
 
 // As `Status` of hmt_ros/inference/bounded_newton.py.
 enum class Status : std::int8_t { converged, iteration_limit, stalled, not_finite };
 
-// Energies at the points `first` to `last` - 1, or minima from there.
+// Energies at the points `first` to `last` - 1, or minima found from these points.
 //
 // `point`, `free`, `rows`, `exact` are as for `PoseEnergy.energy`; without rows point i belongs to
-// problem i. `limits` (2, d) are the lower and the upper ones. Value (n,), gradient (n, f), hessian
-// (n, f, f), status (n,) and iterations (n,) are results; no gradients: no derivatives are wanted.
-// `moving` (n, f) become the variables that do not rest on a limit, and the points x (n, f) minima
-// between the limits; without `moving` they stay.
+// problem i. `limits` (2, d) are the lower and upper limits. Value (n,), gradient (n, f), hessian
+// (n, f, f), status (n,) and iterations (n,) are results; if gradients are empty, there are no
+// derivatives. With `moving` (n, f) the points x (n, f) become minima within the limits, and
+// `moving` marks variables that do not rest on a limit. Without `moving` the points stay.
 void solve(Index first, Index last, const Terms& terms, const Numbers& point, const Places& free,
            const Places& rows, bool exact, const Table& limits, const Descent& descent,
            const Matrix& x, const Vector& value, const Matrix& gradient, const Tensor& hessian,

@@ -14,21 +14,21 @@
 
 namespace hmt {
 
-// Components whose density is this much below the largest are left out, nats: below rounding.
+// Components whose log density is this far below the largest are left out: less than rounding.
 inline constexpr double negligible = 40.0;
 // Responsibility below which a component adds nothing to the derivatives.
 inline constexpr double faint = 1e-12;
 
-// C components over n angles, in rows of m >= n, which are whole lanes; 0 beyond n.
+// C components over n angles; rows have m >= n numbers, whole lanes, which are 0 beyond n.
 struct PriorModel {
   Tables whitening;   // (C, n, m) inverse Cholesky factors W of the covariances, lower triangular
   Tables columns;     // (C, n, m) the transposed W
   Table centres;      // (C, n) W m
-  Numbers constants;  // (C,) log of the weight times the normalisation, over the highest density
+  Numbers constants;  // (C,) log of weight times normalisation, minus highest log density
   Tables precisions;  // (C, n, n)
   Places places;      // (n,) degrees of freedom that the mixture covers
   Numbers means;      // (d,)
-  Numbers rest;       // (d,) precisions of the degrees of freedom beside the mixture
+  Numbers rest;       // (d,) precisions of degrees of freedom missing in the mixture
   double weight;      // factor on the energy
 
   Index components() const { return centres.size(); }
@@ -47,7 +47,7 @@ struct PriorModel {
   }
 };
 
-// Room for one pose after the other.
+// Working space, reused for all poses.
 struct PriorRoom {
   explicit PriorRoom(const PriorModel& model)
       : angles(model.angles()),
@@ -63,7 +63,7 @@ struct PriorRoom {
     }
   }
 
-  // Angles whose places follow one another.
+  // Consecutive angles with consecutive degrees of freedom.
   struct Run {
     Index first, place, length;
   };
@@ -76,8 +76,7 @@ struct PriorRoom {
   Scratch<double, 2> curvature;
 };
 
-// Sets sums of one group of lanes over the rows from `first` to `end` - 1 of a table, times
-// factors.
+// Sets sums of one group of lanes over rows `first` to `end` - 1 of a table, weighted by factors.
 HMT_INLINE void add_rows(const double* table, Index width, const double* factors, Index first,
                          Index end, double* sums) {
   Group<double> low{}, high{};
@@ -91,7 +90,7 @@ HMT_INLINE void add_rows(const double* table, Index width, const double* factors
   result[1] = high;
 }
 
-// The log density of component c at the angles in the room, or -inf far below the best before.
+// The log density of component c at the angles in the room, or -inf if far below the best so far.
 inline double component_log_density(const PriorModel& model, Index c, double best,
                                     const PriorRoom& room) {
   const Index n = model.angles();
@@ -106,7 +105,7 @@ inline double component_log_density(const PriorModel& model, Index c, double bes
     for (Index i = first; i < end; ++i) {
       z[i] = sums[i - first] - centre[i];
       distance += z[i] * z[i];
-      if (distance > limit) return -infinity;  // it only grows
+      if (distance > limit) return -infinity;  // the distance only grows
     }
   }
   return model.constants[c] - 0.5 * distance;
@@ -130,8 +129,8 @@ inline void add_component(const PriorModel& model, Index c, double share, bool e
   }
 }
 
-// The energy of a pose (d,); gradient (d,) and Hessian (d, d) become its derivatives, where they
-// are wanted. `exact`: the Hessian is the exact one, not the positive definite one.
+// The energy of a pose (d,); gradient (d,) and Hessian (d, d) become its derivatives if wanted.
+// `exact`: the exact Hessian instead of the positive definite one.
 HMT_WIDE inline double evaluate_prior(const PriorModel& model, const Numbers& pose, bool exact,
                                       bool wanted, const Vector& gradient, const Matrix& hessian,
                                       const PriorRoom& room) {

@@ -1,4 +1,4 @@
-// One pose as the terms of the image see it.
+// One pose, with the quantities that the image terms use.
 #pragma once
 
 #include "kinematics.h"
@@ -10,8 +10,8 @@ namespace hmt {
 // Settings of a term; weight 0: off.
 struct Weighting {
   double weight, sigma, scale;
-  double magnification;  // px for a metre at the person: turns errors of the body into pixels
-  double growth;         // of the deviation of a depth with its square, 1/m
+  double magnification;  // px per metre at the person, for errors of the body in pixels
+  double growth;         // of a depth's deviation with the squared depth, 1/m
   Numbers segments;      // (S,) factors on the energies at each segment; none: 1
 };
 
@@ -22,7 +22,7 @@ struct Model {
   Lens lens;
   Mask traced;           // (B,) parts whose contour is compared with the image
   Mask occluders;        // (B,) parts that can hide others
-  Index contour_points;  // number of contour points that weights are for; 0: those there are
+  Index contour_points;  // number of contour points that share a weight; 0: actual number
 
   void check() const {
     expect_range("flesh.part_segments", flesh.part_segments, 0, tree.segments());
@@ -32,8 +32,7 @@ struct Model {
   }
 };
 
-// Sums over residuals at the points of a contour: of pull and curvature times the derivatives by
-// the pixel.
+// Sums over residuals at contour points of pull and curvature times derivatives by the pixel.
 struct PixelSums {
   explicit PixelSums(Index points) : rows(5, points) {}
   double* pull(int axis) const { return rows[axis].data; }
@@ -42,7 +41,7 @@ struct PixelSums {
   Scratch<double, 2> rows;
 };
 
-// Room for one pose after the other; it is made once. `model` must outlive it.
+// Working space, made once and reused for all poses. `model` must outlive it.
 class PoseView {
  public:
   explicit PoseView(const Model& body)
@@ -59,7 +58,7 @@ class PoseView {
         occluders(body.flesh.parts(), contour.count) {}
 
   const Model& model;
-  Index number = 0;            // of the pose, of those of a call
+  Index number = 0;            // index of the pose in a call
   Scratch<double, 3> columns;  // (S, 3, 3) of the segments
   Scratch<double, 2> origins;  // (S, 3)
   const RingLanes rings;
@@ -70,7 +69,7 @@ class PoseView {
   mutable std::vector<double> rows_;
 
  public:
-  const Contour contour;  // traced if some term asks for it
+  const Contour contour;  // traced if a term needs it
   const Contour front;    // room for other points of the rings
   const PixelSums pixel_sums;
   const Occluders occluders;
@@ -82,7 +81,7 @@ class PoseView {
   double factor(const Weighting& term, Index part) const {
     return factor_of(term.segments, owner(part));
   }
-  // Room for a term, of so many rows; the next term gets the same.
+  // Working space of a term, with a number of rows; the next term reuses it.
   Matrix rows(Index count, Index length) const {
     rows_.resize(std::max<std::size_t>(rows_.size(), count * length));
     return {rows_.data(), {count, length}};
@@ -102,7 +101,7 @@ class PoseView {
     pixel_sums.curvature(1)[i] += curvature * gu * gv;
     pixel_sums.curvature(2)[i] += curvature * gv * gv;
   }
-  // Adds one residual at each contour point (P,) that is seen.
+  // Adds one residual at each visible contour point (P,).
   void add_all(const double* gu, const double* gv, const double* pull, const double* curvature,
                const Sums& sums) const {
     if (sums.list.data) {
@@ -119,7 +118,7 @@ class PoseView {
   }
 };
 
-// Marks which points of the pose in a view other parts hide.
+// Marks points of the pose in a view that other parts hide.
 inline void mark_points(const PoseView& view, const Contour& points) {
   mark_hidden(view.model.flesh, view.model.occluders, view.rings.extents(), view.columns,
               view.origins, view.occluders,
@@ -127,7 +126,7 @@ inline void mark_points(const PoseView& view, const Contour& points) {
                points.covered, points.hidden});
 }
 
-// Takes in the pose, of this number, whose frames are in a view; its contour if it is to be traced.
+// Prepares the pose whose frames are in a view, with this index; traces its contour if wanted.
 inline void look(PoseView& view, Index number, bool traced) {
   view.number = number;
   view.pixel_sums.rows.fill(0.0);
@@ -137,7 +136,7 @@ inline void look(PoseView& view, Index number, bool traced) {
   mark_points(view, view.contour);
 }
 
-// Takes the sums at the points of the contour to those of the segments.
+// Converts the sums at contour points to sums of the segments.
 HMT_WIDE inline void lift_pixel_sums(const PoseView& view, const Sums& sums) {
   const Contour& contour = view.contour;
   const PixelSums& own = view.pixel_sums;
@@ -177,10 +176,10 @@ inline double contour_sigma(const Weighting& term, double noise) {
   return std::sqrt(term.sigma * term.sigma + blur * blur);
 }
 
-// Fewer visible points than this do not make each of them count more.
+// Minimum number of points that share a weight, so that few visible points do not weigh more.
 inline constexpr Index fewest = 20;
 
-// A weight shared among so many points; 0: among those that are valid and not hidden.
+// Weight per point of a weight that `shared` points share; 0: all valid points that are not hidden.
 inline double weight_of_each(double weight, Index shared, const Contour& points) {
   Index count = shared;
   if (count == 0) {

@@ -1,4 +1,4 @@
-// From Python to the core: arrays, numbers, and named tuples as the structs that read them.
+// Conversion from Python to the core: arrays, numbers, and named tuples to structs.
 #pragma once
 
 #include <pybind11/numpy.h>
@@ -14,8 +14,8 @@ namespace hmt {
 
 namespace py = pybind11;
 
-// Where a value comes from, for errors: "placing.offsets", "by_cue[1]". Its text is made only when
-// needed, from the names of the arguments and the tuples on the way.
+// Path of a value, for error messages: "placing.offsets", "by_cue[1]". The text is only made when
+// needed, from the names of arguments and tuple members along the path.
 struct Name {
   const char* text;
   const Name* outer = nullptr;
@@ -71,7 +71,7 @@ struct TupleOf<std::array<T, N>> : std::true_type {};
   return text;
 }
 
-// Raises the error of an array of another kind than is wanted.
+// Raises the error for an array of the wrong kind.
 [[noreturn, gnu::noinline]] inline void refuse_array(py::handle value, const Name& name, char kind,
                                                      int bytes, int axes, bool written) {
   std::string wanted = kind == 'b' ? "bool" : kind == 'f' ? "float" : kind == 'u' ? "uint" : "int";
@@ -81,7 +81,7 @@ struct TupleOf<std::array<T, N>> : std::true_type {};
                        (written ? " that can be written" : "") + ", saw " + seen(value));
 }
 
-// The array of a kind that is wanted.
+// Returns an argument as an array of the wanted kind.
 [[gnu::noinline]] inline py::array expect_array(py::handle value, const Name& name, char kind,
                                                 int bytes, int axes, bool written) {
   if (py::isinstance<py::array>(value)) {
@@ -111,7 +111,7 @@ template <class T, int N>
   return result;
 }
 
-// A member of a tuple, converted to the type of what it initialises.
+// A member of a tuple, converted to the type of the struct member that it initialises.
 struct Member {
   py::handle tuple;
   std::size_t place;
@@ -177,7 +177,7 @@ template <class T>
   }
 }
 
-// A function that is bound: how it is called with so many arguments, and their names.
+// A bound function: how to call it with its arguments, and their names.
 struct Bound {
   py::object (*call)(const Bound& bound, PyObject* const* arguments);
   void (*function)();
@@ -206,7 +206,7 @@ template <class Result, class... A>
   }
 }
 
-// `names` has one for each argument, with spaces between.
+// `names` has one name for each argument, separated by spaces.
 [[gnu::noinline]] inline void bind_by_names(py::module_& module, Bound bound, std::size_t wanted,
                                             const char* names) {
   for (const char* start = names; *start;) {
@@ -231,15 +231,15 @@ template <class Result, class... A>
       doc.c_str());
 }
 
-// Binds a function of arrays, numbers and structs. `names` are those of its arguments, in order.
-// It runs without the interpreter's lock.
+// Binds a function of arrays, numbers and structs. `names` are the names of its arguments, in
+// order. It runs without the interpreter's lock.
 template <class Result, class... A>
 void bind(py::module_& module, const char* name, Result (*function)(A...), const char* names) {
   bind_by_names(module, {call<Result, A...>, reinterpret_cast<void (*)()>(function), name, {}},
                 sizeof...(A), names);
 }
 
-// The table of numpy's C interface that makes its functions.
+// The table of numpy's C API, which creates its functions.
 inline void** ufunc_interface() {
   py::object module;
   try {

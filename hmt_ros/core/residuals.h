@@ -15,9 +15,9 @@ namespace hmt {
 
 // The skeleton: S segments, d degrees of freedom.
 struct Tree {
-  Places parents;       // (S,) segment above; -1: none
+  Places parents;       // (S,) parent of each segment; -1: none
   Places dof_segments;  // (d,) segment of each degree of freedom
-  Places dof_parents;   // (d,) the one before it on the path from the root; -1: none
+  Places dof_parents;   // (d,) previous one on the path from the root; -1: none
   Mask dof_is_rotation;
 
   Index segments() const { return parents.size(); }
@@ -36,7 +36,7 @@ struct Tree {
   }
 };
 
-// Factors on the energies at S segments: of this name they are finite, for a body of so many.
+// Checks that factors on the energies at segments are finite, one per segment or none.
 inline void expect_factors(const char* name, const Numbers& factors, Index segments) {
   if (!factors.empty()) expect_shape(name, factors, {segments});
   for (double x : factors) expect(0.0 <= x && x < infinity, name, "finite factors, none below 0");
@@ -75,16 +75,16 @@ inline void add_row(const Vector& row, double pull, double curvature, const Vect
   }
 }
 
-// Of one segment: sums of k b b^T (6, 6), then of g b (6,), in rows of whole lanes.
+// Sums of one segment: of k b b^T (6, 6), then of g b (6,), in rows of whole lanes.
 using SegmentSums = std::array<std::array<double, lanes>, 7>;
 
-// Sums of the residuals of one pose by segment, or a list of them; nothing: no derivatives.
+// Sums of the residuals of one pose by segment, or a list of the residuals; empty: no derivatives.
 struct Sums {
   // Columns of a list: segment, point (3), derivative (3), pull, curvature.
   static constexpr int recorded = 9;
 
   Array<SegmentSums, 1> segments;  // (S,)
-  Matrix list;                     // (1 + M, recorded); entry (0, 0) counts them
+  Matrix list;                     // (1 + M, recorded); entry (0, 0) is the count
 
   bool wanted() const { return segments.data != nullptr || list.data != nullptr; }
   void clear() const {

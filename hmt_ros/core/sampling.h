@@ -8,7 +8,7 @@ namespace hmt {
 // Values on a window of the pixel grid, of one or several channels.
 struct ImageMap {
   Array<const float, 3> values;  // (C, h, w)
-  Index left, top;               // the window's first pixel in the whole image
+  Index left, top;               // first pixel of the window in the whole image
 
   void check() const {
     expect(values.size(1) >= 2 && values.size(2) >= 2, "values", "two rows and columns at least");
@@ -20,10 +20,10 @@ struct Sample {
   double value, slope_u, slope_v;
 };
 
-// A coordinate that is no number counts as 0, so that it reads inside the map.
+// A coordinate of NaN counts as 0, so that it reads inside the map.
 inline Index pixel_before(double x) { return x > 0.0 ? static_cast<Index>(x) : 0; }
 
-// A coordinate in a window of so many pixels, with a pixel after it.
+// Clamps a coordinate to a window of `extent` pixels, with a pixel after it.
 inline double inside(double x, Index extent) { return between(x, 0.0, double(extent) - 1.001); }
 
 // The values of four pixels around a place: a, b above, p, q below.
@@ -38,7 +38,7 @@ inline Sample bilinear(const Cell& cell, double du, double dv) {
   return {upper + (lower - upper) * dv, (b - a) * (1.0 - dv) + (q - p) * dv, lower - upper};
 }
 
-// At a pixel of the whole image. Outside the window the nearest value is continued.
+// Samples a map at a pixel of the whole image; outside the window, at the nearest place inside.
 inline Sample sample(const ImageMap& map, Index channel, double u, double v) {
   const Index h = map.values.size(1), w = map.values.size(2);
   const double x = u - double(map.left), y = v - double(map.top);
@@ -51,13 +51,13 @@ inline Sample sample(const ImageMap& map, Index channel, double u, double v) {
   return result;
 }
 
-// How far a coordinate is before the first of so many pixels, below 0, or behind the last one.
+// Distance of a coordinate beyond the last of `extent` pixels or, negative, before the first.
 inline double outside(double x, double extent) {
   return x < 0.0 ? x : x > extent - 1.0 ? x - extent + 1.0 : 0.0;
 }
 
-// The value of a map of distances at a pixel of the whole image, between four of its values.
-// Outside its window it is continued by the way to the window.
+// The interpolated value of a map of distances at a pixel of the whole image. Outside the window,
+// the distance to the window is added.
 inline Sample distance_between(const Cell& cell, const ImageMap& map, double u, double v) {
   const Index h = map.values.size(1), w = map.values.size(2);
   const double x = u - double(map.left), y = v - double(map.top);

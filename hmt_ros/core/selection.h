@@ -1,9 +1,9 @@
-// Choice of few hypotheses that stand for all; see hmt_ros/tracking/selection.py.
+// Choice of a few representative hypotheses; see hmt_ros/tracking/selection.py.
 //
 //     min over S, |S| = K:   sum_i w_i min_{s in S} d(i, s)
 //
-// The K are chosen greedily, the heaviest first; d is the mean distance of the joints, each capped,
-// less what counts as none.
+// The K are chosen greedily, the heaviest first; d is the mean of the capped joint distances, minus
+// a tolerance.
 #pragma once
 
 #include "arrays.h"
@@ -13,8 +13,8 @@
 
 namespace hmt {
 
-// Adds to `totals` how far the J joints of N hypotheses (J, 3, N) are from those of hypothesis a,
-// each capped, for this one and those after it.
+// Adds to `totals` the capped distances of the J joints of N hypotheses (J, 3, N) from those of
+// hypothesis a, for hypothesis a and all later ones.
 HMT_WIDE inline void add_distances(const float* rows, Index joints, Index n, Index a, float cap,
                                    float* totals) {
   for (Index k = 0; k < joints; ++k, rows += 3 * n) {
@@ -32,8 +32,8 @@ HMT_WIDE inline void add_distances(const float* rows, Index joints, Index n, Ind
 inline void fill_distances(const Tables& joints, float same, float cap,
                            const Array<float, 2>& distances) {
   const Index n = joints.size(), count = joints.size(1);
-  // A row a coordinate, so that the innermost loops run along memory; single precision is
-  // micrometres here.
+  // One row per coordinate, so that inner loops run along memory. Single precision is exact to
+  // micrometres.
   Scratch<float, 3> rows(count, 3, n);
   for (Index k = 0; k < count; ++k) {
     for (int x = 0; x < 3; ++x) {
@@ -50,8 +50,8 @@ inline void fill_distances(const Tables& joints, float same, float cap,
   }
 }
 
-// Adds to `gains` (N,) what hypothesis i, at `nearest` from those that are kept, gains if any of N
-// at distances `away` is kept, too.
+// Adds to `gains` (N,) the gain of one hypothesis if one of N candidates is kept, too. `nearest` is
+// its distance from the kept hypotheses, `away` from the candidates.
 HMT_WIDE inline void add_gains(const float* away, Index n, double weight, float nearest,
                                double* gains) {
   for (Index c = 0; c < n; ++c) {
@@ -59,11 +59,11 @@ HMT_WIDE inline void add_gains(const float* away, Index n, double weight, float 
   }
 }
 
-// So many candidates are looked at together, and so many hypotheses at a time.
+// Number of candidates evaluated together, and number of hypotheses in a strip.
 inline constexpr Index together = 8, strip = 32;
 
-// Fills what N hypotheses gain if one that is `away` from them is kept, too, for several. Sums are
-// in order; only what is summed can be computed side by side, so it is put down first.
+// Fills the gain of N hypotheses if a candidate at distances `away` is kept, too, for several
+// candidates. Sums have a fixed order; summands are stored first, so that they are vectorised.
 HMT_WIDE inline void fill_gains(const float* const* away, const float* nearest,
                                 const double* weights, Index n, double* gains) {
   double parts[together][strip];
@@ -82,7 +82,7 @@ HMT_WIDE inline void fill_gains(const float* const* away, const float* nearest,
   }
 }
 
-// The choice as it grows.
+// State of the greedy choice.
 class Selection {
  public:
   Selection(const Tables& joints, const Numbers& weights, float same, float cap)
@@ -94,7 +94,7 @@ class Selection {
     nearest_.fill(cap);
   }
 
-  // Takes the gains of all; it is to be called before the first `best`.
+  // Computes the gains of all; must be called before the first `best`.
   void weigh() {
     const Index n = weights_.size();
     gains_.fill(0.0);
@@ -103,12 +103,12 @@ class Selection {
     }
   }
 
-  // The hypothesis that lessens the expected distance most, the first of these; -1: none does.
+  // The first hypothesis that reduces the expected distance most; -1 if none reduces it.
   Index best() {
-    // Gains only shrink as more are kept: a candidate whose last gain is smaller than the best of
-    // this round need not be looked at again. The one with the largest last gain comes first.
+    // Gains only shrink as more are kept, so candidates whose last gain is below the best of this
+    // round are skipped. The candidate with the largest last gain is evaluated first.
     for (Index c = 0; c < weights_.size(); ++c) {
-      if (nearest_[c] == 0.0f) gains_[c] = 0.0;  // kept, or the same as one that is
+      if (nearest_[c] == 0.0f) gains_[c] = 0.0;  // kept, or equal to a kept one
     }
     Index best = place_of_largest(gains_);
     if (gains_[best] > 0.0) update({best});
@@ -127,7 +127,7 @@ class Selection {
     return gains_[best] > 0.0 ? best : -1;
   }
 
-  // Keeps a hypothesis as number `kept` of the chosen, the owner of those that it is nearest to.
+  // Keeps a hypothesis as number `kept`; it becomes the owner of hypotheses that are nearest to it.
   void keep(Index hypothesis, Index kept, const Array<Index, 1>& owner) {
     const float* away = distances_[hypothesis].data;
     for (Index i = 0; i < weights_.size(); ++i) {
@@ -140,7 +140,7 @@ class Selection {
   }
 
  private:
-  // Takes the present gains of a few.
+  // Updates the gains of a few candidates.
   void update(const std::vector<Index>& some) {
     const float* away[together];
     double gains[together];
@@ -153,11 +153,11 @@ class Selection {
 
   const Numbers weights_;
   Scratch<float, 2> distances_;  // (N, N)
-  Scratch<float, 1> nearest_;    // distances to the nearest that is kept
-  Scratch<double, 1> gains_;     // of the candidates, when they were last looked at
+  Scratch<float, 1> nearest_;    // distances to the nearest kept hypothesis
+  Scratch<double, 1> gains_;     // of the candidates, at their last evaluation
 };
 
-// Fills the log weights (K,) of groups of hypotheses, each with the place of its group.
+// Fills the log weights (K,) of groups of hypotheses; `owner` (N,) is the group of each.
 inline void sum_groups(const Numbers& log_weights, const Places& owner, const Vector& groups) {
   Scratch<double, 1> tops(groups.size()), sums(groups.size());
   tops.fill(-infinity);
@@ -170,13 +170,13 @@ inline void sum_groups(const Numbers& log_weights, const Places& owner, const Ve
   }
 }
 
-// Chooses hypotheses that stand for all, by their joints (N, J, 3) and log weights (N,); returns
-// how many, at most as `chosen` (K,) has place for.
+// Fills `chosen` (K,) with representatives of hypotheses with joints (N, J, 3) and log weights
+// (N,); returns the number of representatives.
 //
-// `same` and `cap` are the mean distance of hypotheses that are one, and the largest that a joint
-// counts with, m. Those in `first` are kept in any case, after the heaviest. `owner` (N,) becomes
-// the place in `chosen` of the one that stands for each, `groups` (K,) the log weights of all that
-// each stands for.
+// `same` is the mean distance below which hypotheses count as equal, `cap` the maximum distance of
+// a joint, m. Hypotheses in `first` are always kept, after the heaviest. `owner` (N,) becomes the
+// place in `chosen` of each hypothesis's representative, `groups` (K,) the log weight that each
+// representative stands for.
 inline Index choose_representatives(const Tables& joints, const Numbers& log_weights, double same,
                                     double cap, const Places& first, const Array<Index, 1>& chosen,
                                     const Array<Index, 1>& owner, const Vector& groups) {
@@ -210,8 +210,8 @@ inline Index choose_representatives(const Tables& joints, const Numbers& log_wei
   return kept;
 }
 
-// Fills `kept` (N,) with the hypotheses whose joints (N, J, 3) are `same` m or more from those of
-// all that were kept before, in the mean, and returns their number. They are looked at in `order`.
+// Fills `kept` (N,) with hypotheses whose joints (N, J, 3) have a mean distance of at least `same`,
+// m, from all hypotheses kept before, in the given `order`; returns their number.
 inline Index keep_apart(const Tables& joints, const Places& order, double same,
                         const Array<Index, 1>& kept) {
   const Index n = joints.size(), count = joints.size(1);

@@ -1,9 +1,10 @@
-// Sums over residuals, by the shape of a person and by the pose; see hmt_ros/body/shape.py.
+// Sums over residuals of derivatives by the shape of a person and by the pose; see
+// hmt_ros/body/shape.py.
 //
-// A residual on the flesh with the derivative a by its point has, by the shape, r = B' f with
-// f = (R' a, u R' a, a) (9,) and B (9, P) the derivatives of centre, radii and origin, which are
-// the same for all points of a segment; by the pose it has q = T' b, with b = (a, p x a) and twists
-// T (6, d). So sums of f f' and f b' over the residuals of a segment suffice.
+// A residual on the flesh has the derivative a by its point, r = B' f by the shape, and q = T' b by
+// the pose. Here f = (R' a, u R' a, a) (9,), and B (9, P) are the derivatives of centre, radii and
+// origin, which are the same for all points of a segment; b = (a, p x a), and T (6, d) are twists.
+// So sums of f f' and f b' over the residuals of a segment suffice.
 #pragma once
 
 #include "kinematics.h"
@@ -15,10 +16,10 @@ namespace hmt {
 struct ShapeTable {
   Places part_of;                   // (S,) part on each segment; -1: none
   Table centres, radii;             // (B, 3)
-  Tables by_centre, by_radius;      // (B, 3, P) their derivatives
+  Tables by_centre, by_radius;      // (B, 3, P) derivatives of these by the variables
   Tables joint_basis;               // (J, 3, L)
-  Array<const Index, 2> variables;  // (S, V) those that move the flesh of each segment
-  Places counts;                    // (S,) of these
+  Array<const Index, 2> variables;  // (S, V) variables that move the flesh of a segment
+  Places counts;                    // (S,) number of these variables
 
   Index segments() const { return part_of.size(); }
   Index lengths() const { return joint_basis.size(2); }
@@ -39,7 +40,7 @@ struct ShapeTable {
   }
 };
 
-// Lists of residuals (N, 1 + M, recorded) must count their rows and name places less than `places`.
+// Checks lists of residuals (N, 1 + M, recorded): the counts of rows, and indices below `places`.
 inline void expect_residuals(const char* name, const Tables& lists, Index poses, Index places) {
   expect_shape(name, lists, {poses, -1, Sums::recorded});
   for (Index n = 0; n < poses; ++n) {
@@ -59,7 +60,7 @@ inline std::array<double, 6> wrench_of(const double* p, const double* a) {
   return {a[0], a[1], a[2], turned[0], turned[1], turned[2]};
 }
 
-// The sums of one pose after the other.
+// The sums of one pose, reused for all poses.
 class ShapeSums {
  public:
   explicit ShapeSums(const ShapeTable& table)
@@ -112,8 +113,8 @@ class ShapeSums {
     }
   }
 
-  // Takes the sums of the flesh to the variables of the shape: adds to the gradient (P,) and to
-  // the curvature (P, P). The lift (S, 3, L) are the derivatives of the origins.
+  // Converts the sums of the flesh to derivatives by the shape: adds to the gradient (P,) and to
+  // the curvature (P, P). The lift (S, 3, L) is the derivative of the origins by the lengths.
   void spread_flesh(const Tables& lift, const Vector& gradient, const Matrix& curvature) {
     for (Index s = 0; s < table_.segments(); ++s) {
       if (seen_[s]) spread_segment(s, lift, gradient, curvature);
@@ -218,8 +219,8 @@ class ShapeSums {
 };
 
 // Adds sum g r (N, P) and sum c r r' (N, P, P) and sets sum c r q' (N, P, d) of residuals on the
-// flesh and at joints (N, 1 + M, recorded) of N poses, whose frames come pose by pose. The lifts
-// (N, S, 3, L) are the derivatives of the origins by the lengths.
+// flesh and at joints (N, 1 + M, recorded) of N poses, whose frames are stored pose by pose. The
+// lifts (N, S, 3, L) are the derivatives of the origins by the lengths.
 inline void sum_shape_residuals(const ShapeTable& table, const Array<const double, 4>& lifts,
                                 const Places& parents, const Places& dof_segments,
                                 const Mask& is_rotation, const Places& joint_segments,

@@ -1,13 +1,14 @@
-// What poses and the shape of a person tell of each other; see hmt_ros/tracking/shape_estimation.py
-// for the equations. Of K modes with d variables and P of the shape, `mixed` (K, P, d) are the
-// second derivatives by shape and pose, `covariances` (K, d, d) those of the poses.
+// Joint estimation of poses and the shape of a person; equations in
+// hmt_ros/tracking/shape_estimation.py. For K modes with d variables and a shape with P variables,
+// `mixed` (K, P, d) are the second derivatives by shape and pose, `covariances` (K, d, d) the
+// covariances of the poses.
 #pragma once
 
 #include "small_matrix.h"
 
 namespace hmt {
 
-// A matrix row by row, or its transpose.
+// A row-major matrix, or its transpose.
 inline matrices::Strided<double> strided(const Table& matrix) {
   return {reinterpret_cast<char*>(const_cast<double*>(matrix.data)),
           matrix.size(1) * Index(sizeof(double)), sizeof(double)};
@@ -28,8 +29,8 @@ inline void expect_modes(const Tables& mixed, const Tables& covariances) {
   expect_shape("covariances", covariances, {k, d, d});
 }
 
-// The variables of the shape with derivatives (P, d) by a pose; what the others would add is zero:
-// without contours all of the flesh.
+// The variables of the shape with nonzero derivatives (P, d) by a pose. The others, such as the
+// flesh without contours, add zero and are skipped.
 inline std::vector<Index> coupled(const Table& mixed) {
   std::vector<Index> rows;
   for (Index p = 0; p < mixed.size(); ++p) {
@@ -44,7 +45,7 @@ inline Scratch<double, 2> rows_of(const Table& matrix, const std::vector<Index>&
   return result;
 }
 
-// Fills the covariances (K, d, d) of modes due to that of the shape (P, P).
+// Fills the covariances (K, d, d) of modes due to the covariance of the shape (P, P).
 inline void consider_shape(const Tables& mixed, const Tables& covariances, const Table& of_shape,
                            const Tensor& result) {
   const Index k = mixed.size(), p = mixed.size(1), d = mixed.size(2);
@@ -68,10 +69,10 @@ inline void consider_shape(const Tables& mixed, const Tables& covariances, const
   }
 }
 
-// Shortens a shift (d,) of a pose whose angles, `turns`, change by `most_turn` at most. The root
-// goes where it then is best: an image does not tell the size of a person from the distance, and a
-// root that was held back would. Angles that rest on a limit have no variance. False if what the
-// angles' covariance says is singular.
+// Limits a shift (d,) of a pose: its angles, marked by `turns`, change by at most `most_turn`. The
+// root moves to its conditional optimum: an image does not separate the size of a person from the
+// distance, but a limited root would. Angles that rest on a limit have no variance. False if the
+// covariance of the angles is singular.
 inline bool limit_shift(const Table& covariance, const Mask& turns, double most_turn,
                         const Vector& shift) {
   const Index d = shift.size();
@@ -105,10 +106,10 @@ inline bool limit_shift(const Table& covariance, const Mask& turns, double most_
   return true;
 }
 
-// Sets the information (P, P) and the pull (P,) on the shape by modes with weights (K,), whose
-// poses give way: those of S and g. `by_shape` (K, P) and `curvature` (K, P, P) are the derivatives
-// by the shape, gradients (K, d) those by the pose; for `turns` and `most_turn` see `limit_shift`.
-// False where a covariance is singular.
+// Sets the information (P, P) and the pull (P,) on the shape from modes with weights (K,), with
+// poses eliminated: S and g of the equations. `by_shape` (K, P) and `curvature` (K, P, P) are the
+// derivatives by the shape, `gradients` (K, d) by the pose; for `turns` and `most_turn` see
+// `limit_shift`. False if a covariance is singular.
 inline bool inform_shape(const Table& by_shape, const Tables& curvature, const Tables& mixed,
                          const Numbers& weights, const Table& gradients, const Tables& covariances,
                          const Mask& turns, double most_turn, const Matrix& information,

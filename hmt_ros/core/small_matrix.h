@@ -1,7 +1,9 @@
-// Linear algebra of matrices up to some hundreds of rows, with the same bytes on every processor.
+// Linear algebra of matrices with up to a few hundred rows, with identical results on every
+// processor.
 //
-// BLAS and LAPACK choose kernels by processor, which sum in different orders. Here every sum has a
-// fixed order; vectors run across columns, that is, across sums, so that their width changes none.
+// BLAS and LAPACK select kernels by processor, which sum in different orders. Here every sum has a
+// fixed order; vectors run across columns, that is, across sums, so their width does not change
+// results.
 #pragma once
 
 #include "arrays.h"
@@ -13,7 +15,7 @@ namespace hmt::matrices {
 
 HMT_INLINE Group<double>& group(double* row) { return *reinterpret_cast<Group<double>*>(row); }
 
-// Rows of numbers at distances that are a multiple of `group_size`.
+// Rows of numbers; their stride is a multiple of `group_size`.
 struct Rows {
   double* data;
   Index stride;
@@ -27,7 +29,7 @@ HMT_INLINE void divide(double* row, double divisor, Index first, Index last) {
   for (Index b = first; b < last; b += group_size) group(row + b) /= divisor;
 }
 
-// Distance of two rows of whole lanes.
+// Stride of rows of whole lanes.
 HMT_WIDE inline double distance(const double* one, const double* other, Index width) {
   double sums[lanes] = {};
   for (Index i = 0; i < width; i += lanes) {
@@ -37,11 +39,11 @@ HMT_WIDE inline double distance(const double* one, const double* other, Index wi
   return std::sqrt(sum_lanes(sums));
 }
 
-// Cholesky factorisation, rows of the upper factor in place; reads and leaves right what is not
-// left of the diagonal. False for a matrix that is not positive definite.
+// Cholesky factorisation in place, to rows of the upper factor; only entries on or right of the
+// diagonal are read, and valid afterwards. False if the matrix is not positive definite.
 bool factorise(Rows u, Index n);
 
-// Gaussian elimination with partial pivoting of (n, n) and of what stands right of it, in place.
+// Gaussian elimination with partial pivoting of (n, n) and of the columns right of it, in place.
 // Returns the sign of the permutation, or 0 for a singular matrix.
 double eliminate(Rows u, Index n);
 
@@ -49,9 +51,9 @@ double eliminate(Rows u, Index n);
 void solve_upper(Rows u, Index n, Index first);
 void solve_lower(Rows l, Index n, Index first);
 
-// Inverse of a positive definite matrix, of which it reads what is not left of the diagonal, in
-// place; `room` holds as much. Makes the logarithm of the determinant of the matrix. False, with
-// nothing of use in place, if the matrix is not positive definite.
+// Inverts a positive definite matrix in place; only entries on or right of the diagonal are read,
+// and `room` has the same size. Sets the log determinant of the matrix. If the matrix is not
+// positive definite, returns false, and entries are undefined.
 HMT_WIDE inline bool invert_positive(Rows u, Index n, Rows room, double& log_determinant) {
   log_determinant = 0.0;
   for (Index a = 0; a < n; ++a) {
@@ -81,7 +83,7 @@ HMT_WIDE inline bool invert_positive(Rows u, Index n, Rows room, double& log_det
   return true;
 }
 
-// Turns two rows by an angle.
+// Rotates two rows by an angle.
 HMT_INLINE void rotate(double* p, double* q, double cosine, double sine, Index width) {
   for (Index b = 0; b < width; b += group_size) {
     const Group<double> old = group(p + b);
@@ -92,8 +94,8 @@ HMT_INLINE void rotate(double* p, double* q, double cosine, double sine, Index w
 
 inline constexpr int most_sweeps = 60;
 
-// Reduces a symmetric matrix to tridiagonal form by reflections: its diagonal and what lies beside
-// it. Row k keeps the reflection k right of its diagonal, `scales` its factor; `work` holds a row.
+// Reduces a symmetric matrix by reflections to tridiagonal form: diagonal and off-diagonal. Row k
+// stores reflection k right of its diagonal, `scales` its factor; `work` has room for a row.
 HMT_WIDE inline void make_tridiagonal(Rows a, Index n, double* diagonal, double* beside,
                                       double* scales, double* work) {
   for (Index k = 0; k + 1 < n; ++k) {
@@ -134,12 +136,12 @@ HMT_WIDE inline void multiply_reflections(Rows a, Index n, const double* scales,
 }
 
 // Eigenvalues of a symmetric tridiagonal matrix by the QL method with implicit shifts; they replace
-// the diagonal, in no order. The rotations turn the rows of `vectors`, if there are any. False
-// where it does not converge.
+// the diagonal, unsorted. The rotations are applied to the rows of `vectors`, if there are any.
+// False if the iteration does not converge.
 HMT_WIDE inline bool diagonalise(double* diagonal, double* beside, Index n, Rows vectors) {
   for (Index first = 0; first < n; ++first) {
     for (int sweep = 0;; ++sweep) {
-      Index last = first;  // of the block that does not fall apart
+      Index last = first;  // last row of the block that cannot be split
       while (last + 1 < n &&
              !(std::abs(beside[last]) <=
                0x1p-53 * (std::abs(diagonal[last]) + std::abs(diagonal[last + 1])))) {
@@ -179,9 +181,9 @@ HMT_WIDE inline bool diagonalise(double* diagonal, double* beside, Index n, Rows
   return true;
 }
 
-// Makes columns, the largest of them near to 1, orthogonal by rotations (one-sided Jacobi): rows of
-// `columns` and, with them, rows of `turns`, at first the identity. False where it does not
-// converge.
+// Makes columns orthogonal by rotations (one-sided Jacobi); the largest should be near 1. The
+// columns are rows of `columns`; the same rotations are applied to rows of `turns`, initially the
+// identity. False if the iteration does not converge.
 HMT_WIDE inline bool orthogonalise(Rows columns, Rows turns, Index count) {
   for (int sweep = 0; sweep < most_sweeps; ++sweep) {
     bool turned = false;
@@ -207,7 +209,7 @@ HMT_WIDE inline bool orthogonalise(Rows columns, Rows turns, Index count) {
   return false;
 }
 
-// The power of two that takes numbers up to this size near to 1, so that squares neither overflow
+// The power of two that scales numbers up to this size to near 1, so that squares neither overflow
 // nor vanish.
 inline double scale_of(double largest) {
   int exponent = 0;
@@ -225,8 +227,8 @@ struct Strided {
   }
 };
 
-// Matrix product (m, inner) (inner, n); `room` for inner pairs of groups. The sums of a single
-// column are those of `dot`.
+// Matrix product (m, inner) (inner, n); `room` for inner pairs of groups. A single column is summed
+// as by `dot`.
 void multiply(Strided<double> a, Strided<double> b, Strided<double> result, Index m, Index inner,
               Index n, double* room);
 void multiply(Strided<float> a, Strided<float> b, Strided<float> result, Index m, Index inner,

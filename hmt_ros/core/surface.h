@@ -9,9 +9,9 @@
 
 namespace hmt {
 
-// Parts are grown by this factor when they hide others: superquadrics are fatter than ellipsoids.
+// Growth factor of parts that hide others, because superquadrics are larger than ellipsoids.
 inline constexpr double cover = 1.04;
-// A point this much behind the front of another part, relative to its distance, is hidden by it.
+// Depth behind the front of another part, relative to its distance, from which a point is hidden.
 inline constexpr double behind = 0.004;
 
 // A ring of the flesh.
@@ -28,7 +28,7 @@ struct FleshTable {
   Places ring_parts;
   Table ring_centres, ring_radii, ring_slopes, ring_leans;
   Numbers ring_exponents;
-  // (R, 2) how far contours of people lie from the model's at the sides, and in front, m
+  // (R, 2) deviation of people's contours from the model's, at the sides and in front, m
   Table ring_noise;
 
   Index parts() const { return part_segments.size(); }
@@ -49,7 +49,7 @@ struct FleshTable {
     expect_shape("ring_exponents", ring_exponents, {r});
     expect_shape("ring_noise", ring_noise, {r, 2});
   }
-  // Frames (S, 3, 3), (S, 3) must be there for all parts.
+  // Checks that frames (S, 3, 3), (S, 3) exist for all parts.
   void check_frames(const Tables& columns, const Table& origins) const {
     expect_shape("columns", columns, {-1, 3, 3});
     expect_shape("origins", origins, {columns.size(), 3});
@@ -57,8 +57,8 @@ struct FleshTable {
   }
 };
 
-// Rings of the parts that are wanted side by side, n of them with some more to whole lanes; made
-// once for many poses.
+// Rings of the wanted parts side by side, n of them, padded to whole lanes; made once for many
+// poses.
 class RingLanes {
  public:
   RingLanes(const FleshTable& flesh, const Mask& wanted)
@@ -94,9 +94,9 @@ class RingLanes {
   // Part (2n,) of each point.
   const Index* parts() const { return parts_.view().data; }
   const Index* segments() const { return segments_.view().data; }
-  // How far rings reach from the centres of their parts (B,), m.
+  // Maximum distances (B,) of the rings from the centres of their parts, m.
   const double* extents() const { return extents_.view().data; }
-  // Rings that are no ellipse, or that lean by different slopes.
+  // Rings that are not elliptic, or that have two different slopes.
   const std::vector<Index>& odd() const { return odd_; }
   const double* centre(int axis) const { return rows_[axis].data; }
   const double* radius(int axis) const { return rows_[3 + axis].data; }
@@ -125,7 +125,7 @@ class RingLanes {
   std::vector<Index> odd_;
 };
 
-// Points on the surface at one pose side by side: of n rings points i and n + i, P = 2n.
+// Points on the surface at one pose side by side: ring i of n has points i and n + i, P = 2n.
 struct Contour {
   const Index* parts;         // of the points
   Index count;                // P, whole lanes
@@ -134,10 +134,10 @@ struct Contour {
   std::array<double*, 6> by;  // derivative (2, 3) of the pixels by the points
   double *nx, *ny, *nz;       // normals of the surface, of any length
   double *nu, *nv;            // unit normals out of the body, in the image
-  double* noise;              // how far contours of people lie from the point, a deviation, m
-  double* valid;              // 1: the point exists and lies before the camera, or 0
-  double* covered;            // 1: another part lies on the same ray, before or behind, or 0
-  double* hidden;             // 1: another part lies on the same ray, before, or 0
+  double* noise;              // standard deviation of people's contours from the point, m
+  double* valid;              // 1 if the point exists and is in front of the camera, else 0
+  double* covered;            // 1 if another part is on the same ray, else 0
+  double* hidden;             // 1 if another part is in front on the same ray, else 0
   double *cosine, *sine;      // of the angle on the ring
 
   bool shows(Index i) const { return valid[i] > hidden[i]; }
@@ -234,8 +234,8 @@ inline bool bracketed_roots(const ContourCondition& condition, double* cosines, 
   return found[0] && found[1];
 }
 
-// Cosines and sines (2,) of the angles of the contour on a ring that is no ellipse or leans by
-// different slopes; false if missing.
+// Cosines and sines (2,) of the angles of the contour on a ring that is not elliptic or has
+// different slopes; false if there is no contour.
 inline bool contour_angles(const Ring& ring, double bx, double by, double uz, double* cosines,
                            double* sines) {
   const ContourCondition condition{bx, by, uz, ring.slopes[0], ring.slopes[1], 2.0 - ring.exponent};
@@ -245,7 +245,7 @@ inline bool contour_angles(const Ring& ring, double bx, double by, double uz, do
 // Frames (12, n) of the segments that carry rings: axes (3, 3), origin (3,).
 struct RingFrames {
   explicit RingFrames(const RingLanes& rings) : rows(12, rings.count()) {}
-  // Takes in a pose.
+  // Sets the frames of a pose.
   void place(const RingLanes& rings, const Tables& columns, const Table& origins) const {
     double* at = rows.view().data;
     const Index n = rings.count();
@@ -262,7 +262,7 @@ struct RingFrames {
   Scratch<double, 2> rows;
 };
 
-// The direction (bx, by) in which a ring's normals turn to the camera, and the depth uz of the
+// The direction (bx, by) in which a ring's normals face the camera, and the depth uz of the
 // camera along its axis; see ContourCondition.
 struct Turned {
   double x, y, depth;
@@ -279,7 +279,7 @@ inline Turned turned_ring(const RingLanes& rings, const RingFrames& frames, Inde
           (seen[1] - seen[2] * rings.lean(1)[i]) / rings.radius(1)[i], seen[2]};
 }
 
-// Sets angles of the contour, and which points there are.
+// Sets the angles of the contour, and which points exist.
 inline void find_angles(const RingLanes& rings, const RingFrames& frames, const Contour& contour) {
   const Index n = rings.count();
 #pragma omp simd
@@ -385,7 +385,7 @@ HMT_WIDE inline void trace_contour(const RingLanes& rings, const RingFrames& fra
   }
 }
 
-// A part as others see it: |A (x - c)| = 1.
+// A part as an occluder, an ellipsoid: |A (x - c)| = 1.
 struct Ellipsoid {
   double centre[3];  // c
   double distance;   // |c|
@@ -428,7 +428,7 @@ inline Cone cone_of(double radius, double distance) {
   return {sine, std::sqrt(1.0 - sine * sine)};
 }
 
-// Points side by side and the parts that they are of, which do not hide them.
+// Points side by side, and their own parts, which do not hide them.
 struct Visible {
   Index count;  // whole lanes
   const Index* parts;
@@ -436,7 +436,7 @@ struct Visible {
   double *covered, *hidden;
 };
 
-// Room for parts that may hide points of others, which are so many whole lanes.
+// Working space for parts that may hide points of other parts, in whole lanes.
 struct Occluders {
   Occluders(Index parts, Index points)
       : ellipsoids(parts), cones(parts), near(parts + 1), ends(points / lanes, 2) {}
@@ -465,7 +465,7 @@ inline void mark_lanes(const Ellipsoid& e, Index b, const Visible& points, Index
     const double mm = m0 * m0 + m1 * m1 + m2 * m2, mk = m0 * k0 + m1 * k1 + m2 * k2;
     const double discriminant = mk * mk - mm * outside;
     const double root = std::sqrt(discriminant > 0.0 ? discriminant : 0.0);
-    // What is behind the camera covers nothing.
+    // Surfaces behind the camera cover nothing.
     const double hit = discriminant > 0.0 && mk + root > 0.0 ? others[i] : 0.0;
     const double before = mk - root < (1.0 - behind) * mm ? hit : 0.0;
     covered[i] = hit > covered[i] ? hit : covered[i];
@@ -473,9 +473,9 @@ inline void mark_lanes(const Ellipsoid& e, Index b, const Visible& points, Index
   }
 }
 
-// Marks points with other parts on their rays, and those with parts before them. `occluders` (B,)
-// are the parts that can hide; `extents` (B,) how far points lie from the centres of their parts,
-// m. Points that are not valid are neither covered nor hidden.
+// Marks points as covered if another part is on their ray, and as hidden if it is in front.
+// `occluders` (B,) are the parts that can hide others; `extents` (B,) the maximum distances of
+// points from the centres of their parts, m. Invalid points are neither covered nor hidden.
 HMT_WIDE inline void mark_hidden(const FleshTable& flesh, const Mask& occluders,
                                  const double* extents, const Tables& columns, const Table& origins,
                                  const Occluders& room, const Visible& points) {
@@ -500,7 +500,7 @@ HMT_WIDE inline void mark_hidden(const FleshTable& flesh, const Mask& occluders,
   for (Index b = 0; b < count; ++b) {
     if (!occluders[b]) continue;
     const Ellipsoid& e = all[b];
-    // Balls whose cones do not touch, by a hair for rounding, hide nothing of each other.
+    // Balls whose cones do not touch, with a margin for rounding, do not hide each other.
     const Cone own = cone_of(e.largest, e.distance);
     for (Index a = 0; a < count; ++a) {
       const Cone& other = cones[a];
@@ -522,10 +522,10 @@ struct ContourTable {
   Matrix pixels;           // (P, 2)
   Tensor projections;      // (P, 2, 3) derivative of the pixels by the points
   Matrix normals;          // (P, 2) out of the body, in the image
-  Array<bool, 1> valid;    // the point exists and lies before the camera
-  Array<bool, 1> covered;  // another part lies on the same ray, before or behind
-  Array<bool, 1> hidden;   // another part lies on the same ray, before
-  Vector noise;            // how far contours of people lie from the point, a deviation, m
+  Array<bool, 1> valid;    // the point exists and is in front of the camera
+  Array<bool, 1> covered;  // another part is on the same ray, in front or behind
+  Array<bool, 1> hidden;   // another part is in front on the same ray
+  Vector noise;            // standard deviation of people's contours from the point, m
 
   Index count() const { return parts.size(); }
   void check() const {
@@ -541,14 +541,14 @@ struct ContourTable {
   }
 };
 
-// For Python: fills the contour of one pose, but for what hides it. `wanted` (B,) are the parts
+// For Python: fills the contour of one pose, without occlusion. `wanted` (B,) are the parts
 // whose contour is traced; the others have no valid points.
 void fill_contour(const FleshTable& flesh, const Mask& wanted, const Lens& lens,
                   const Tables& columns, const Table& origins, const ContourTable& result);
 
-// Marks points (P, 3) with other parts on their rays, and those with parts before them. `occluders`
-// (B,) are the parts that can hide, `parts` (P,) those that a point is of, which do not hide it;
-// points that are not valid are neither covered nor hidden.
+// Marks points (P, 3) as covered if another part is on their ray, and as hidden if it is in front.
+// `occluders` (B,) are the parts that can hide others, `parts` (P,) the part of each point, which
+// does not hide it. Invalid points are neither covered nor hidden.
 void mark_visibility(const FleshTable& flesh, const Mask& occluders, const Tables& columns,
                      const Table& origins, const Places& parts, const Table& points,
                      const Mask& valid, const Array<bool, 1>& covered,

@@ -5,15 +5,15 @@
 
 namespace hmt {
 
-// A surface that faces the camera less than this (cosine) is seen too flat.
+// Minimum cosine between normal and ray; flatter surfaces are not used.
 inline constexpr double least_facing = 0.3;
 
 // Up to Q points on the visible surface of each of K poses.
 struct SurfacePoints {
-  Places counts;                   // (K,) points of each pose; the rest of its row is not used
+  Places counts;                   // (K,) number of points per pose; the rest of a row is unused
   Array<const Index, 2> segments;  // (K, Q)
-  Tables local;                    // (K, Q, 3) places in the frames of the segments, m
-  Tables pixels;                   // (K, Q, 2) where they are seen
+  Tables local;                    // (K, Q, 3) positions in the frames of the segments, m
+  Tables pixels;                   // (K, Q, 2) pixels of the points
 
   void check() const {
     const Index k = counts.size(), q = segments.size(1);
@@ -38,7 +38,7 @@ struct Vertices {
   }
 };
 
-// Where a camera of a size (2,), px, sees points unless others (h, w) are there.
+// Image of a size (2,), px, in which points are visible except at pixels of other people (h, w).
 struct Scene {
   Lens lens;
   std::array<double, 2> size;

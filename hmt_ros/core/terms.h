@@ -19,8 +19,8 @@ using TermInputs = std::tuple<CoverageInputs,  //
                               DepthInputs>;
 inline constexpr Index term_count = std::tuple_size_v<TermInputs>;
 
-// Inputs, an argument of this name, must be for a body of so many segments, and have room for the
-// results of so many poses.
+// Checks that the inputs, an argument of this name, fit the number of segments, and have room for
+// the results of all poses.
 inline void check_inputs(const char* name, const TermInputs& inputs, Index segments,
                          Index poses) try {
   const auto one = [&](const auto& own) {
@@ -32,7 +32,7 @@ inline void check_inputs(const char* name, const TermInputs& inputs, Index segme
   throw Misfit(std::string(name) + "." + error.what());
 }
 
-// Runs the terms that are on for the pose in a view; their energies (terms,) are set.
+// Evaluates the active terms for the pose in a view; sets their energies (terms,).
 inline void run_terms(const PoseView& view, const TermInputs& inputs, const Vector& energies,
                       const Sums& sums) {
   double* energy = energies.data;

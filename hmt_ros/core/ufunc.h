@@ -1,7 +1,7 @@
-// Functions of numpy's kind (ufuncs), which broadcast, convert and loop as numpy's own.
+// numpy ufuncs, which broadcast, convert and loop like numpy's own functions.
 //
-// They are made by numpy's C interface, whose table a capsule holds, as pybind11 does for arrays:
-// so no headers of numpy are needed to build, and none of pybind11, which are slow to compile.
+// They are created by numpy's C API, whose table is in a capsule, as pybind11 does for arrays. So
+// the build needs no headers of numpy here, and none of pybind11, which are slow to compile.
 #pragma once
 
 #include <Python.h>
@@ -20,10 +20,10 @@ namespace hmt {
 // A loop of numpy: pointers to the first elements, the count, strides in bytes, and `data`.
 using UfuncLoop = void (*)(char** pointers, const Index* counts, const Index* strides, void* data);
 
-// What numpy asks for after a loop: overflow, a division by zero, no number.
+// Sets the exceptions that numpy reads after a loop: overflow, division by zero, invalid operation.
 inline void report_only(int exceptions) {
 #ifdef __SSE2__
-  _mm_setcsr(_mm_getcsr() & ~63u);  // in a tenth of the time of the next
+  _mm_setcsr(_mm_getcsr() & ~63u);  // ten times as fast as the portable call
 #else
   std::feclearexcept(FE_ALL_EXCEPT);
 #endif
@@ -36,12 +36,12 @@ using BinaryBlock = void (*)(const double* x, const double* y, double* result, I
 
 struct Elementwise {
   void* block;
-  int at_infinity;  // what an infinite result of finite arguments is
+  int at_infinity;  // exception for an infinite result of finite arguments
 };
 
 inline constexpr Index block_size = 256;
 
-// Numbers from anywhere as a block; `room` holds them unless they lie together.
+// Strided numbers as a contiguous block; they are copied to `room` unless they are contiguous.
 template <class T>
 const double* gathered(const char* from, Index stride, Index count, double* room) {
   if (std::is_same_v<T, double> && stride == sizeof(double)) {
@@ -53,7 +53,7 @@ const double* gathered(const char* from, Index stride, Index count, double* room
   return room;
 }
 
-// Calls the function for blocks of N arguments of type T, float or double; in double throughout.
+// Calls the function for blocks of N arguments of type T, float or double; it computes in double.
 template <class T, int N>
 void elementwise_loop(char** pointers, const Index* counts, const Index* strides, void* data) {
   const auto& function = *static_cast<const Elementwise*>(data);
@@ -65,7 +65,7 @@ void elementwise_loop(char** pointers, const Index* counts, const Index* strides
     for (int a = 0; a < N; ++a) {
       x[a] = gathered<T>(pointers[a] + start * strides[a], strides[a], count, room[a]);
     }
-    // numpy's results lie on the arguments or apart from them.
+    // numpy's results are either the arguments' memory or do not overlap it.
     char* to = pointers[N] + start * strides[N];
     bool direct = std::is_same_v<T, double> && strides[N] == sizeof(T);
     for (int a = 0; a < N; ++a) direct = direct && to != static_cast<const void*>(x[a]);
@@ -95,7 +95,7 @@ void elementwise_loop(char** pointers, const Index* counts, const Index* strides
   report_only(exceptions);
 }
 
-// Adds what numpy has made to a module.
+// Adds an object that numpy has created to a module.
 inline void add(const UfuncModule& module, const char* name, PyObject* made) {
   if (!made || PyModule_AddObject(module.object, name, made) < 0) throw std::runtime_error(name);
 }
@@ -109,7 +109,7 @@ void bind_block(const UfuncModule& module, const char* name, const Elementwise& 
   std::fill_n(types + N + 1, N + 1, 12);  // NPY_DOUBLE
   using Make = PyObject* (*)(UfuncLoop*, void**, const char*, int, int, int, int, const char*,
                              const char*, int);
-  auto* kept = new Elementwise(function);  // as long as the module lives
+  auto* kept = new Elementwise(function);  // lives as long as the module
   auto** data = new void*[2]{kept, kept};
   const auto make = reinterpret_cast<Make>(module.numpy[1]);
   constexpr int no_identity = -1;
@@ -135,7 +135,7 @@ inline void bind_matrix_function(const UfuncModule& module, const char* name,
   using Make = PyObject* (*)(UfuncLoop*, void**, const char*, int, int, int, int, const char*,
                              const char*, int, const char*);
   const int kinds = int(loops.size()), arrays = inputs + outputs;
-  // As long as the module lives.
+  // These live as long as the module.
   auto* kept = new std::vector<UfuncLoop>(loops);
   auto* data = new std::vector<void*>(kinds, nullptr);
   auto* types = new std::vector<char>(kinds * arrays, 12);        // NPY_DOUBLE

@@ -1,14 +1,14 @@
 """BlazePose, the detector of MediaPipe Pose: 33 landmarks of one person, in pixels and in metres.
 
-Two networks find them. The first searches the whole image for a person, and outputs the middle of
-the hips and a point of a circle around the body. The second sees the square around that circle,
-turned upright, and outputs landmarks, positions and a mask. Two of its landmarks define the circle
-again, so that the next image needs the second network alone. One-euro filters smooth landmarks and
-circle:
+Two networks find the landmarks. The first one searches the whole image for a person, and outputs
+the middle of the hips and a point on a circle around the body. The second one sees the square
+around this circle, turned upright, and outputs landmarks, positions and a mask. Two of its outputs
+define the circle again, so that the next image needs only the second network. One-euro filters
+smooth landmarks and circle:
 
     y_t = y_(t-1) + a(f) (x_t - y_(t-1)),    f = f_0 + b |v_t|,    a(f) = 1 / (1 + 1 / (2 pi f dt))
 
-with the smoothed velocity v_t of x_t (Casiez, Roussel, Vogel, CHI 2012). Numbers are those of
+with the smoothed velocity v_t of x_t (Casiez, Roussel, Vogel, CHI 2012). Constants are from
 MediaPipe 0.10.21. The networks run in this process, in one thread, without Python's lock.
 """
 
@@ -41,15 +41,16 @@ LANDMARKS = 33
 _LONGEST_INTERVAL = 1_000_000_000
 # Sides of the inputs of the networks, px, and of the heat maps of landmarks.
 _PERSON_SIZE, _LANDMARK_SIZE, _HEAT_SIZE = 224, 256, 64
-# Cell sizes of the first network, px, and predictions per cell; overlap above which two are one.
+# Cell sizes of the first network, px, predictions per cell, and overlap (intersection over union)
+# above which two predictions are merged.
 _STRIDES, _PREDICTIONS, _SAME = (8, 16, 32), (2, 2, 6), 0.3
-# Minimum probability that somebody is there, and that a pixel belongs to the person.
+# Minimum probability of a person, and minimum probability that a pixel belongs to the person.
 _SEEN = 0.5
-# Quality of a person who lies or is upside down, relative to an upright person.
+# Factor on the quality of a person who lies or is upside down.
 _LYING = 0.6
-# Half side of the window of a heat map around its landmark, cells; its minimum peak.
+# Half side of the window around a landmark in its heat map, cells, and minimum peak in this window.
 _HEAT_REACH, _HEAT_PEAK = 4, 0.5
-# Cutoffs f_0 of the one-euro filters, Hz, and factors b on velocities, which raise them.
+# Cutoffs f_0 of the one-euro filters, Hz, and factors b with which velocities raise them.
 _VELOCITY_CUTOFF = 1.0
 _LANDMARK_CUTOFF, _CIRCLE_CUTOFF, _POSITION_CUTOFF = (0.05, 80.0), (0.01, 10.0), (0.1, 40.0)
 # Weight of a new image in the smoothed visibility.
@@ -62,7 +63,7 @@ class BlazePose:
     """Follows one person from image to image.
 
     Args:
-        with_mask: whether `mask` is wanted as well.
+        with_mask: whether to compute `mask` as well.
 
     Attributes:
         mask: (H, W) pixels of the person in the last image; None without `with_mask`.
@@ -82,16 +83,17 @@ class BlazePose:
     def detect(self, image: Image, stamp_ns: int) -> Keypoints | None:
         """The landmarks of the person in an image, named as in the scheme 'mediapipe33'.
 
-        An image begins a new sequence if it is not newer than the one before, is newer by more than
-        1 s, or has another size.
+        An image starts a new sequence if it is not newer than the previous image, is newer by more
+        than 1 s, or differs in size.
 
         Args:
             image: (H, W, 3) BGR.
-            stamp_ns: of the image.
+            stamp_ns: stamp of the image.
 
         Returns:
-            The keypoints, with unknown covariances, the visibilities as confidences, and positions
-            in m from the middle of the hips along the axes of the camera. None if nobody was seen.
+            The keypoints, with unknown covariances, visibilities as confidences, and positions in m
+            relative to the middle of the hips, along the axes of the camera. None if nobody was
+            seen.
         """
         interval = stamp_ns - self._newest
         if not 0 < interval <= _LONGEST_INTERVAL or image.shape[:2] != self._size:
@@ -111,17 +113,17 @@ class BlazePose:
         return self._followed.smooth(found, interval * 1e-9)
 
     def _circle(self, image: Image) -> Array | None:
-        """Centre and a point (2, 2) of the circle around the surest person; None if unseen."""
+        """Centre and a point (2, 2) of the circle around the best-scored person, px; or None."""
         height, width = image.shape[:2]
         whole = Square((width / 2, height / 2), max(height, width), 0.0)
         return next((circle for _, circle in self._networks.circles(image, whole)), None)
 
 
 class Networks:
-    """The two networks: people in a square of an image, and the landmarks of one person.
+    """The two networks, which find people in a square of an image, and landmarks of one person.
 
     Raises:
-        DetectorError: they are not installed.
+        DetectorError: the networks are not installed.
     """
 
     def __init__(self) -> None:
@@ -130,16 +132,16 @@ class Networks:
         self._anchors = _anchors()
 
     def circles(self, image: Image, square: Square) -> Iterator[tuple[float, Array]]:
-        """Scores of people and circles around them (centre and a point, (2, 2), px), surest first.
+        """Yields score and circle (centre and a point, (2, 2), px) of people, highest score first.
 
-        Predictions that overlap with the surest remaining one are averaged with it.
+        Predictions that overlap with the best remaining one are averaged with it.
         """
         seen = square.seen(image, _PERSON_SIZE, cv2.BORDER_CONSTANT)
         boxes, logits = self._person(seen * np.float32(2 / 255) - np.float32(1))
         scores = sigmoid(logits[:, 0].astype(np.float64))
         chosen = np.flatnonzero(scores >= _SEEN)
         scores = scores[chosen]
-        # Middle and size of the face, then points of the body, as fractions of the square.
+        # Centre and size of the face, then points on the body, as fractions of the square.
         points = boxes[chosen].astype(np.float64).reshape(-1, 6, 2) / _PERSON_SIZE
         points[:, [0, 2, 3]] += self._anchors[chosen, None]
         while len(scores):
@@ -155,7 +157,7 @@ class Networks:
             points, scores = points[~same], scores[~same]
 
     def landmarks(self, image: Image, square: Square) -> Found | None:
-        """The landmarks of the person in a square; None if nobody is there."""
+        """The landmarks of the person in a square; None if it shows nobody."""
         if square.side < 1.0:
             return None
         seen = square.seen(image, _LANDMARK_SIZE, cv2.BORDER_REPLICATE)
@@ -186,12 +188,12 @@ class Found:
     """The output of the second network for one image.
 
     Attributes:
-        square: its input.
+        square: square of the image that the network saw.
         points: (35, 2) landmarks, then centre and point of the circle, px.
-        visibilities: (33,) of the landmarks.
-        positions: (33, 3) of the landmarks, m.
-        mask: (256, 256) logits of the person in the square.
-        presence: probability that somebody is there.
+        visibilities: (33,) visibilities of the landmarks, 0 to 1.
+        positions: (33, 3) 3D positions of the landmarks, m.
+        mask: (256, 256) logits of the pixels of the person in the square.
+        presence: probability that the square shows a person.
     """
 
     square: Square
@@ -203,17 +205,17 @@ class Found:
 
     @property
     def quality(self) -> float:
-        """Presence and visibility, 0 to 1; less for somebody who is not upright."""
+        """Presence times mean visibility, 0 to 1; reduced for a person who is not upright."""
         upright = max(float(elementary.cos(self.square.angle)), 0.0)
         share = _LYING + (1.0 - _LYING) * upright
         return self.presence * float(self.visibilities.mean()) * share
 
 
 class Followed:
-    """The smoothed values of a person, from image to image.
+    """Smooths the landmarks and the circle of a person over successive images.
 
     Attributes:
-        circle: (2, 2) centre and point where the person is sought in the next image, px.
+        circle: (2, 2) centre and point of the circle to search in the next image, px.
     """
 
     def __init__(self) -> None:
@@ -224,7 +226,7 @@ class Followed:
         self._of_positions = _OneEuroFilter(*_POSITION_CUTOFF)
 
     def smooth(self, found: Found, interval: float) -> Keypoints:
-        """The keypoints that were found, smoothed, `interval` s after the image before."""
+        """Smooths the output for an image that is `interval` s newer than the previous one."""
         landmarks, circle = found.points[:LANDMARKS], found.points[LANDMARKS:]
         diameter = max(2 * math.hypot(*(circle[1] - circle[0])), 1.0)
         self.circle = self._of_circle(circle, interval, diameter)
@@ -235,21 +237,21 @@ class Followed:
         pixels = self._of_landmarks(landmarks, interval, diameter)
         positions = self._of_positions(found.positions, interval, 1.0)
         unknown = np.full((LANDMARKS, 2, 2), np.nan)
-        # The network counts from the edge of the first pixel.
+        # The network's origin is the edge of the first pixel.
         return Keypoints(
             schemes()[SCHEME].names, pixels - 0.5, unknown, self._visibilities, positions
         )
 
 
 class _OneEuroFilter:
-    """Smooths an array, less where it changes faster; see the head of the module."""
+    """Smooths an array, fast-changing values less; see the head of the module."""
 
     def __init__(self, cutoff: float, gain: float) -> None:
         self._cutoff, self._gain = cutoff, gain
         self._last: Array | None = None
 
     def __call__(self, values: Array, interval: float, scale: float) -> Array:
-        """The smoothed values; `scale` is the unit of length of velocities."""
+        """Smooths the next values; `scale` is the unit of length of velocities."""
         if self._last is None:
             self._smoothed, self._velocity = values, np.zeros_like(values)
         else:
@@ -263,7 +265,7 @@ class _OneEuroFilter:
 
 
 class _Network:
-    """A network of a file, in one thread."""
+    """A network that is read from a file and runs in one thread."""
 
     def __init__(self, name: str) -> None:
         content = blazepose_models.require_network(name)
@@ -291,7 +293,7 @@ def _anchors() -> Array:
 
 
 def _refined(points: Array, heat: _Tensor) -> Array:
-    """Points (n, 2), fractions of the image, moved to the mean of the heat around each.
+    """Moves points (n, 2), fractions of the image, to the mean of the heat around them.
 
     Args:
         heat: (64, 64, n) logits of heat maps.

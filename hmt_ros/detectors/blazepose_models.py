@@ -1,6 +1,7 @@
-"""The networks of MediaPipe Pose: files of the wheel of MediaPipe, under its Apache licence.
+"""The networks of MediaPipe Pose, two files of MediaPipe's wheel under the Apache licence.
 
-`install` takes them from the wheel; MediaPipe itself, which needs numpy below 2, is not installed.
+`install` extracts them from the wheel; MediaPipe itself, which needs numpy below 2, is not
+installed.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from hmt_ros.detectors.network_files import NetworkFiles, run_installer
 RUNTIME, RUNTIME_MODULE = 'ai-edge-litert', 'ai_edge_litert'
 PERSON = 'pose_detection.tflite'
 LANDMARKS = 'pose_landmark_full.tflite'
-# The files in the wheel of a release of MediaPipe.
+# Files in the wheel of this release of MediaPipe, with their SHA-256.
 FILES = NetworkFiles(
     'blazepose',
     'mediapipe==0.10.21',
@@ -28,7 +29,7 @@ FILES = NetworkFiles(
     },
 )
 
-# pip's options for a wheel that every release of it accepts; all wheels have the same networks.
+# Options of pip for a fixed wheel, on any platform; all wheels contain the same networks.
 _ANY_WHEEL = (
     *('--no-deps', '--only-binary=:all:', '--platform=manylinux_2_28_x86_64'),
     *('--python-version=3.12', '--implementation=cp', '--abi=cp312'),
@@ -36,7 +37,7 @@ _ANY_WHEEL = (
 
 
 def has_networks() -> bool:
-    """Whether all networks are there."""
+    """Whether the files of all networks exist."""
     return FILES.are_there()
 
 
@@ -51,7 +52,7 @@ def is_installed() -> bool:
 
 
 def require_network(name: str) -> bytes:
-    """Content of a network's file.
+    """Reads the file of a network.
 
     Raises:
         DetectorError: the detector is not installed.
@@ -67,10 +68,10 @@ def require_network(name: str) -> bytes:
 
 
 def install() -> None:
-    """Installs LiteRT with pip, and takes the networks out of the wheel of MediaPipe.
+    """Installs LiteRT with pip, and extracts the networks from the wheel of MediaPipe.
 
     Raises:
-        ValueError: pip fails, or the wheel has other networks; the message is one line.
+        ValueError: pip fails, or the wheel contains other files; the message is one line.
     """
     if not has_runtime():
         _pip('install', RUNTIME)

@@ -1,8 +1,8 @@
 """The colours of a person's clothes, on torso and legs, which distinguish people.
 
-A part is the area between its landmarks: the quadrangle of shoulders and hips, or legs whose width
-is a fraction of the length of the trunk. Its colours are a histogram; the distance of two parts is
-the square of Hellinger's, 1 - sum sqrt(p q), from 0 to 1.
+The torso is the quadrangle between shoulders and hips; the legs are lines through their landmarks,
+as wide as a fraction of the length of the trunk. The colours of a part are a histogram; the
+distance of two histograms is the squared Hellinger distance 1 - sum sqrt(p q), from 0 to 1.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from hmt_ros.inference.arrays import Array, Image
 
 TORSO = ('left_shoulder', 'right_shoulder', 'right_hip', 'left_hip')
 LEGS = (('left_hip', 'left_knee', 'left_ankle'), ('right_hip', 'right_knee', 'right_ankle'))
-# Minimum number of pixels of a part; ratio of the width of a leg to the length of the trunk.
+# Minimum number of pixels of a part, and width of a leg as a fraction of the length of the trunk.
 FEWEST, WIDTH = 40, 0.22
-# Minimum visibility of a landmark that counts; maximum side of the image of a person, px.
+# Minimum visibility of a landmark that is used, and maximum side of the image of a person, px.
 VISIBLE, SIDE = 0.5, 96
 
 
 @dataclass(frozen=True, eq=False)
 class Clothes:
-    """Shares (2, BINS^3) of colours on torso and legs; NaN if the part is not seen."""
+    """Colour histograms (2, BINS^3) of torso and legs, with sum 1; NaN if a part is not seen."""
 
     shares: Array
 
     @classmethod
     def of(cls, image: Image, keypoints: Keypoints) -> Clothes:
-        """The clothes of somebody in an image (H, W, 3) BGR."""
+        """The clothes of a person in an image (H, W, 3) BGR."""
         at = dict(zip(keypoints.names, keypoints.pixels, strict=True))
         seen = dict(zip(keypoints.names, keypoints.confidences >= VISIBLE, strict=True))
         counts = np.zeros((3, BINS**3), np.int64)
@@ -66,12 +66,12 @@ class Clothes:
         return cls(np.where(sizes >= FEWEST, counts[1:] / np.maximum(sizes, 1), np.nan))
 
     def distance(self, other: Clothes) -> float:
-        """Mean distance of the parts that both have, 0 to 1; NaN without such a part."""
+        """Mean distance over the parts that both have, 0 to 1; NaN if they share no part."""
         each = 1.0 - np.sqrt(self.shares * other.shares).sum(1)
         return float(np.nanmean(each)) if np.isfinite(each).any() else np.nan
 
     def mixed(self, other: Clothes, share: float) -> Clothes:
-        """These colours mixed with a share of others; a part that one lacks is the other's."""
+        """Mixes these colours with a share of others; a part missing in one is copied."""
         mixed = self.shares + share * (other.shares - self.shares)
         known = np.where(np.isnan(self.shares), other.shares, self.shares)
         return Clothes(np.where(np.isnan(mixed), known, mixed))

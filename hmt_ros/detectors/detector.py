@@ -1,6 +1,7 @@
-"""The interface of detectors of keypoints, and of their construction and installation.
+"""Interface of keypoint detectors, and of their construction and installation.
 
-A new detector is a file beside this one with a `DetectorKind`, and a line in `registry.DETECTORS`.
+A new detector needs a file in this folder with a `DetectorKind`, and a line in
+`registry.DETECTORS`.
 """
 
 from __future__ import annotations
@@ -14,19 +15,19 @@ from hmt_ros.inference.arrays import Image, Mask
 
 
 class DetectorError(ValueError):
-    """The detector is not installed; the message, one line, says what to run."""
+    """The detector is not installed; the message, of one line, says what to run."""
 
 
 class Detector(Protocol):
-    """Finds the keypoints of one person, from image to image.
+    """Finds the keypoints of one person in successive images.
 
-    A detector may follow the person through a sequence of images; that is all its state. It is
+    A detector may follow the person through a sequence of images, and has no other state. It is
     deterministic: the same images with the same stamps give the same output. It draws no random
     numbers and reads no clock.
 
     Attributes:
-        mask: (H, W) pixels of the person in the last image; None if no mask was requested, or the
-            detector has none.
+        mask: (H, W) pixels of the person in the last image; None if no mask was requested or the
+            detector does not make masks.
     """
 
     mask: Mask | None
@@ -34,18 +35,17 @@ class Detector(Protocol):
     def detect(self, image: Image, stamp_ns: int) -> Keypoints | None:
         """The keypoints of the person in an image.
 
-        An image that is not newer than the one before, or that has another size, begins a new
-        sequence.
+        An image that is not newer than the previous one, or differs in size, starts a new sequence.
 
         Args:
             image: (H, W, 3) BGR, with square pixels.
             stamp_ns: stamp of the image.
 
         Returns:
-            Landmarks under the names of a scheme of `keypoint_schemes.yaml`, pixels with (0, 0) at
-            the centre of the first pixel, covariances, px^2, or NaN where unknown, and confidences
-            from 0 to 1; `positions`, m, along the axes of the camera, if the detector
-            lifts. None if nobody was seen.
+            Landmarks with names of a scheme of `keypoint_schemes.yaml`, pixels with (0, 0) at the
+            centre of the first pixel, covariances in px^2 (NaN where unknown), confidences from 0
+            to 1, and, if the detector estimates them, 3D `positions` in m along the axes of the
+            camera. None if nobody was seen.
         """
         ...
 
@@ -56,10 +56,10 @@ class DetectorKind:
 
     Attributes:
         title: name of the detector, for users.
-        make: `make(with_mask=...)` makes a detector that has seen no image; `with_mask` is whether
-            `mask` is wanted as well. Raises DetectorError if the detector is not installed.
+        make: `make(with_mask=...)` makes a detector that has seen no image; `with_mask` says
+            whether to compute `mask`. Raises DetectorError if the detector is not installed.
         is_installed: whether the detector can run here.
-        install: installs what is missing; raises ValueError, in one line, if that fails.
+        install: installs missing files; raises ValueError with a message of one line if it fails.
     """
 
     title: str

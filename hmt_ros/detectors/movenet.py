@@ -1,16 +1,17 @@
-"""MoveNet Thunder beside BlazePose: two detectors of one person in one image.
+"""Mean of MoveNet Thunder and BlazePose: two detectors of the same person in each image.
 
-BlazePose finds the person. MoveNet sees the square around its landmarks, as far as they lie in the
-image, and estimates shoulders, elbows, wrists, hips, knees and ankles again. Their errors of 10 and
-8 px vary over a clip and have a correlation of 0.4, so the best mean counts MoveNet twice. If the
-two differ by a vector d, px, the covariance of the mean is s^2 1 + d d' / 4, with the standard
-deviation s for BlazePose's confidence. All else is BlazePose's.
+BlazePose finds the person. MoveNet sees the square around BlazePose's landmarks, clipped to the
+image, and estimates shoulders, elbows, wrists, hips, knees and ankles again. The errors, 10 px of
+BlazePose and 8 px of MoveNet, vary over a clip and have a correlation of 0.4, so the best mean
+gives MoveNet twice the weight. If the two differ by a vector d, px, the covariance of the mean is
+s^2 1 + d d' / 4, where s is the standard deviation for BlazePose's confidence. All other output is
+from BlazePose.
 
-MoveNet has four heads of 64 x 64 cells: probabilities of the centre of a person and of the
-landmarks, the vectors from a centre to the landmarks, and those from the cell of a landmark to it.
-The centre is the cell with the largest probability, which counts less at the border. A landmark is
-in the cell with the largest ratio of probability to distance from the place that the centre
-predicts.
+MoveNet has four heads of 64 x 64 cells: probabilities of the centre of a person, probabilities of
+the landmarks, vectors from a centre to the landmarks, and offsets of the landmarks from their
+cells. The centre is the cell with the largest probability, weighted less near the border. The
+centre predicts the places of the landmarks; a landmark is in the cell with the largest ratio of
+probability to distance from the predicted place.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from hmt_ros.inference.arrays import Array, Image, Mask
 SCHEME = 'coco17'
 # Offset added to the distance of a cell from the expected place of a landmark, cells.
 _NEAR = 1.8
-# MoveNet's share in the mean; its minimum score that counts.
+# MoveNet's share in the mean, and minimum score of a landmark that is used.
 _SHARE, _LEAST_SCORE = 2 / 3, 0.3
 # Index of the first of MoveNet's landmarks that is not in the face.
 _BODY = 5
@@ -51,7 +52,7 @@ class MoveNet:
         self._network = cv2.dnn.readNetFromONNX(np.frombuffer(onnx, np.uint8))
 
     def landmarks(self, seen: Image) -> Array:
-        """Landmarks (17, 3) in an image (256, 256, 3) RGB: column, row (fractions of it), score."""
+        """Landmarks (17, 3) in an image (256, 256, 3) RGB: column and row as fractions, score."""
         scaled = seen.astype(np.float32) * np.float32(2 / 255) - np.float32(1)
         self._network.setInput(np.ascontiguousarray(scaled.transpose(2, 0, 1)[None]))
         heat, centre, ways, offsets = (x[0] for x in self._network.forward(HEADS))
@@ -64,13 +65,13 @@ def chosen(
     ways: NDArray[np.float32],
     offsets: NDArray[np.float32],
 ) -> Array:
-    """Landmarks (n, 3) of the surest person: column, row (fractions of the image), score.
+    """Landmarks (n, 3) of the likeliest person: column and row as fractions of the image, score.
 
     Args:
         heat: (n, 64, 64) probabilities of landmarks.
         centre: (64, 64) weighted probability of a centre.
-        ways: (2 n, 64, 64) rows and columns from a centre to the landmarks, cells.
-        offsets: (2 n, 64, 64) rows and columns from a cell to the landmarks, cells.
+        ways: (2 n, 64, 64) vectors (row, column) from a centre to the landmarks, cells.
+        offsets: (2 n, 64, 64) vectors (row, column) from a cell to its landmark, cells.
     """
     at = np.divmod(int(centre.argmax()), CELLS)
     expected = ways[:, at[0], at[1]].reshape(-1, 2).astype(np.float64) + at
@@ -104,7 +105,7 @@ class BlazePoseAndMoveNet:
         if square.side < 1.0:
             return found
         told = self._second.landmarks(square.seen(image, SIZE, cv2.BORDER_REPLICATE))
-        # The network counts from the edge of the first pixel of the square.
+        # The network's origin is the edge of the first pixel of the square.
         pixels = square.corner + square.side * (told[:, :2] - 0.5 / SIZE)
         rows = np.array([found.names.index(name) for name in schemes()[SCHEME].names[_BODY:]])
         own = found.pixels[rows]
@@ -114,12 +115,12 @@ class BlazePoseAndMoveNet:
 
 
 def together(found: Keypoints, rows: NDArray[np.intp], pixels: Array) -> Keypoints:
-    """Keypoints, some of which are averaged with those of a second detector.
+    """Averages some keypoints with those of a second detector.
 
     Args:
         found: keypoints of the first detector.
-        rows: (m,) indices of those that the second detector found.
-        pixels: (m, 2) their places by the second detector.
+        rows: (m,) indices of the keypoints that the second detector found, too.
+        pixels: (m, 2) pixels of these keypoints from the second detector.
     """
     apart = pixels - found.pixels[rows]
     places, covariances = found.pixels.copy(), found.covariances.copy()

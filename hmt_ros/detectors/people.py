@@ -1,16 +1,16 @@
-"""Several people in the images of one camera, with identities: BlazePose with a crop for each.
+"""Detects several people per image with BlazePose, and keeps their identities.
 
-- The network that looks for people finds those who fill 0.4 to 0.8 of what it sees, for sure. It
-  sees the whole image, and tiles of it that overlap, down to the size of people `SMALLEST` px high:
-  in the first image all, later one after the other, all of them in `SEARCH` s. While somebody is
-  lost it sees the place where they are expected, too. Who is followed already is left out.
-- The network of landmarks sees the square about each person where the last image had them, moved
-  on by their velocity.
-- Two squares that have found one body leave it to the one in which it is seen better.
-- Those found are assigned to those known by place, motion and the colours of their clothes, with
-  the least sum of costs, nats (`_Person.cost`, `clothes`).
-- Who is then lost beside somebody is looked for with those who are seen painted over. Who is lost
-  for longer than `KEPT` gets a new identity.
+- The person network reliably finds people who fill 0.4 to 0.8 of its input. It searches the whole
+  image and overlapping tiles; the smallest tiles suit people `SMALLEST` px high. The first image is
+  searched completely, later images a few tiles at a time, so that each tile is searched once in
+  `SEARCH` s. The expected place of a lost person is searched, too. Known people are ignored.
+- The landmark network sees a square around each person: the square of the last image, shifted by
+  the person's velocity.
+- If two squares show the same body, the detection of better quality is kept.
+- Detections are assigned to known people by position, velocity and the colours of clothes. The
+  assignment has the smallest sum of costs, nats (`_Person.cost`, `clothes`).
+- A person who is lost near a visible person is searched for with the visible people painted over.
+  A person who is lost for longer than `KEPT` gets a new identity.
 """
 
 from __future__ import annotations
@@ -33,38 +33,41 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.inference.error_model import seconds
 
-MOST = 4  # people
-# Time in which all tiles are seen; time between two looks at the place of a lost person, and for
-# which they are known, s.
+MOST = 4  # maximum number of people
+# Time in which all tiles are searched, interval between searches for a lost person, and time after
+# which a lost person is forgotten, s.
 SEARCH, LOOK, KEPT = 1.0, 0.1, 3.0
-# Time after which smoothing begins again; time in which somebody is confirmed who appears beside
-# another or is seen badly, s; quality from which somebody is seen well.
+# Gap after which smoothing restarts, s; age at which a doubtful person is confirmed, s; minimum
+# quality of a person who is confirmed at once.
 LOST, CONFIRMED, EVIDENT = 0.5, 0.3, 0.75
-# Height of the smallest people who are looked for, px; what they fill of the smallest tile; the
-# ratio of the sizes of tiles; the part of a tile that the next one shows, too.
+# Height of the smallest people, px; fraction of the smallest tile that they fill; maximum ratio of
+# successive tile sizes; overlap of neighbouring tiles, as a fraction of a tile.
 SMALLEST, FILLED, RATIO, OVERLAP = 150.0, 0.4, 1.9, 0.4
-# Time without a change after which somebody is a picture, and from look to look, s.
+# Time without a change after which a person is a picture, and interval between comparisons, s.
 STILL, COMPARED = 10.0, 1.0
-# Distance of circles, over their radius, and of bodies, over their size, below which two are one.
+# Limits for two detections to be one person: distance of new circles, in radii; distance of
+# landmarks, in sizes; difference from a known circle, in radii; overlap, in smaller boxes.
 SAME_CIRCLE, SAME_BODY, ALIKE, CONTAINED = 0.6, 0.08, 0.25, 0.8
-# Ratio of sizes from which two bodies are not one; distance, in sizes, from which one is alone.
+# Size ratio above which two detections are different people; distance below which people are
+# neighbours, in sizes.
 LARGEST_RATIO, BESIDE = 1.6, 1.0
-# What people are painted over with, grey levels.
+# Grey level with which people are painted over.
 GREY = 128
-# The circles that the first network finds may be too small.
+# Factors on the radius of a detected circle, which may be too small.
 SCALES = (1.0, 1.5, 2.4)
-# Standard deviation of the place of a person, in sizes, its growth a second, and the share of the
-# speed in that: one who moves may turn round.
+# Standard deviation of the position of a person, in sizes, its growth per second, and the fraction
+# of the speed that adds to this growth, because a moving person may turn round.
 NEAR, SPEED, TURN = 0.08, 0.35, 0.5
-# Distance of clothes that is as likely of one person as of two, what changes it by a nat, and what
-# colours say at most, nats. Of one person 99 % of the distances are below 0.47; of two 95 % above.
+# Distance of clothes that is equally likely for one person and for two, change of it that is worth
+# 1 nat, and maximum effect, nats. 99 % of distances within a person are below 0.47, and 95 % of
+# distances between people are above.
 DIFFERENT, DOUBT, MOST_NATS = 0.4, 0.06, 4.0
-# The largest cost of a pair, nats; below this one the clothes of a person are learned.
+# Maximum cost of an assignment, and cost below which the clothes of a person are updated, nats.
 LARGEST, SURE = 3.0, 0.0
-# Time constant of the clothes of a person, s; the fewest landmarks of somebody.
+# Time constant of the clothes of a person, s; minimum number of visible landmarks.
 CLOTHES_TIME, FEWEST = 2.0, 8
 
-# Rows of the landmarks of trunk and limbs; which of these are the same on the other side.
+# Indices of the landmarks of trunk and limbs, and their permutation that exchanges the sides.
 _NAMES = schemes()[SCHEME].names
 _JOINTS = [
     f'{side}_{x}'
@@ -81,8 +84,8 @@ class SeenPerson(NamedTuple):
     Attributes:
         name: identity, p1, p2, ...
         keypoints: landmarks of the scheme 'mediapipe33'.
-        corners: (2, 2) left top and right bottom of the visible ones, px.
-        still: whether the image about them has not changed for `STILL` s: a poster, or a statue.
+        corners: (2, 2) top left and bottom right corner of the visible landmarks, px.
+        still: whether the image around the person has not changed for `STILL` s, as for a poster.
     """
 
     name: str
@@ -93,19 +96,19 @@ class SeenPerson(NamedTuple):
 
 @dataclass(eq=False)
 class _Person:
-    """Somebody who is known.
+    """A known person.
 
     Attributes:
         name: identity.
-        place: where they were last seen, and how they move.
+        place: last position and velocity in the image.
         clothes: usual colours.
-        followed: smoothed values; None: lost.
-        keypoints: of the last image that showed them.
-        seen, begun: stamps of the last and of the first image that showed them, ns.
-        looked: stamp of the last image whose part about the place of a lost person was searched.
-        sure: whether this is somebody: one who appears beside another may be that one again.
-        picture: the last image that showed something else about them, looked at once a second.
-        changed, compared: stamps of that image, and of the last look, ns.
+        followed: smoothed landmarks and circle.
+        keypoints: keypoints in the last image that showed the person.
+        seen, begun: stamps of the last and of the first image that showed the person, ns.
+        looked: stamp of the last search around the expected place while the person was lost, ns.
+        sure: whether the person is confirmed; a new person next to another one may be a duplicate.
+        picture: last image that differed around the person, compared once a second.
+        changed, compared: stamps of the last change around the person and last comparison, ns.
     """
 
     name: str
@@ -122,7 +125,7 @@ class _Person:
     compared: int
 
     def cost(self, one: _Sighted, stamp: int) -> float:
-        """Of taking somebody for this person, nats against taking them for somebody else."""
+        """Cost of assigning a detection to this person rather than to another one, nats."""
         dt = seconds(stamp - self.place.stamp)
         speed = float(np.linalg.norm(self.place.velocity)) / self.place.size
         away = self.place.cost(one.sighting, stamp) / (NEAR + (SPEED + TURN * speed) * dt)
@@ -130,7 +133,7 @@ class _Person:
         return 0.5 * away * away + float(np.clip(np.nan_to_num(colours), -MOST_NATS, MOST_NATS))
 
     def update(self, image: Image, one: _Sighted, stamp: int) -> None:
-        """Takes what the next image that shows them says."""
+        """Updates the person from a detection in the next image."""
         if seconds(stamp - self.compared) >= COMPARED:
             self.compared = stamp
             if not self.picture.shows_again(image, one.keypoints):
@@ -149,13 +152,13 @@ class _Person:
 
 @dataclass(frozen=True, eq=False)
 class _Sighted:
-    """Somebody in an image.
+    """A detection of a person in an image.
 
     Attributes:
-        found: what the network of landmarks says.
-        keypoints: the same, not smoothed.
-        sighting: those of them that are visible.
-        clothes: colours.
+        found: output of the landmark network.
+        keypoints: landmarks in this image, not smoothed.
+        sighting: visible landmarks and their bounding box.
+        clothes: colours of the clothes.
     """
 
     found: Found
@@ -165,18 +168,18 @@ class _Sighted:
 
     @property
     def circle(self) -> Array:
-        """Centre and a point (2, 2) of the circle about the body, px."""
+        """Centre of the circle around the body and a point on the circle, (2, 2), px."""
         return self.found.points[-2:]
 
 
 class PeopleDetector:
-    """Finds and follows several people.
+    """Detects and tracks several people.
 
     Args:
         most: maximum number of people.
 
     Attributes:
-        left_out: number of people beyond `most` in the last image that was searched.
+        left_out: number of new people in the last image who were ignored because of `most`.
 
     Raises:
         DetectorError: the detector is not installed.
@@ -188,18 +191,18 @@ class PeopleDetector:
         self._networks = networks or Networks()
         self._people: list[_Person] = []
         self._size, self._newest, self._count = (0, 0), 0, 0
-        # Number of the next tile, and how many are due.
+        # Index of the next tile, and number of tiles that are due.
         self._next_tile, self._due_tiles = 0, 0.0
 
     def detect(self, image: Image, stamp_ns: int) -> list[SeenPerson]:
-        """The people in an image, with identities, in the order in which they came.
+        """People in an image, with identities, in the order of their first appearance.
 
-        An image that is not younger than the one before, or of another size, begins a new sequence;
-        identities are not given again.
+        An image that is not newer than the previous one, or differs in size, starts a new sequence;
+        identities are never reused.
 
         Args:
             image: (H, W, 3) BGR.
-            stamp_ns: of the image.
+            stamp_ns: stamp of the image.
         """
         interval = stamp_ns - self._newest
         if interval <= 0 or image.shape[:2] != self._size:
@@ -231,7 +234,7 @@ class PeopleDetector:
     # Finding.
 
     def _look(self, image: Image, circle: Array, scales: tuple[float, ...] = ()) -> _Sighted | None:
-        """Somebody in the square about a circle, or upright in squares of other sizes."""
+        """Best detection in the square around a circle or in upright, scaled squares, or None."""
         found = self._networks.landmarks(image, Square.about(circle))
         for scale in scales:
             radius = scale * float(np.linalg.norm(circle[1] - circle[0]))
@@ -254,7 +257,7 @@ class PeopleDetector:
         return _Sighted(found, keypoints, Sighting.of(seen, corners), clothes)
 
     def _tiles_due(self, interval: int) -> list[Square]:
-        """The tiles of the image that are to be searched `interval` ns after the image before."""
+        """Tiles to search in an image, `interval` ns after the previous image."""
         tiles = _tiles(*self._size[::-1])
         due = self._due_tiles + len(tiles) * seconds(interval) / SEARCH
         count = int(min(due, len(tiles)))
@@ -265,7 +268,7 @@ class PeopleDetector:
     def _searched(
         self, image: Image, known: list[_Sighted], squares: list[Square]
     ) -> list[_Sighted]:
-        """People in squares of an image; of those who are known, such as may be seen better so."""
+        """Detections in squares of an image, except at circles like those of known detections."""
         looked: list[Array] = []
         result = []
         for square in squares:
@@ -281,7 +284,7 @@ class PeopleDetector:
     # Identities.
 
     def _assign(self, image: Image, sighted: list[_Sighted], stamp: int) -> None:
-        """Tells people in an image who they are, and looks behind them for those who are hidden."""
+        """Assigns detections to people, searches for hidden people, and adds new ones."""
         costs = np.array([[x.cost(one, stamp) for one in sighted] for x in self._people])
         pairs: dict[int, _Person] = {}
         if costs.size:
@@ -305,7 +308,7 @@ class PeopleDetector:
     def _behind(
         self, image: Image, person: _Person, sighted: list[_Sighted], stamp: int
     ) -> _Sighted | None:
-        """A lost person where they are expected, with those who are seen there painted over."""
+        """Detection of a lost person with the visible people there painted over, or None."""
         circle = person.followed.circle + person.place.shift(stamp)
         before = [x for x in sighted if _apart(x.circle, circle) < BESIDE]
         if not before:
@@ -333,7 +336,7 @@ class PeopleDetector:
 
 
 def _places(lost: list[_Person], stamp: int) -> list[Square]:
-    """Squares about the places where lost people are expected, if they are due."""
+    """Squares around the expected places of lost people, if a search is due."""
     result = []
     for person in lost:
         if seconds(stamp - person.looked) >= LOOK:
@@ -345,7 +348,7 @@ def _places(lost: list[_Person], stamp: int) -> list[Square]:
 
 @lru_cache(maxsize=4)
 def _tiles(width: int, height: int) -> list[Square]:
-    """The whole image, and squares of it that overlap, the largest first."""
+    """The whole image and overlapping square tiles of it, largest first."""
     whole, least = float(max(width, height)), SMALLEST / FILLED
     levels = max(math.ceil(math.log(whole / least) / math.log(RATIO)), 0)
     result = [Square((width / 2, height / 2), whole, 0.0)]
@@ -357,7 +360,7 @@ def _tiles(width: int, height: int) -> list[Square]:
 
 
 def _middles(length: int, side: float) -> list[float]:
-    """Middles of the tiles along one axis of the image."""
+    """Centres of the tiles along one axis of the image."""
     beyond = length - (1.0 + 0.25 * OVERLAP) * side
     count = 1 + max(math.ceil(beyond / ((1.0 - OVERLAP) * side)), 0)
     if count == 1:
@@ -366,7 +369,7 @@ def _middles(length: int, side: float) -> list[float]:
 
 
 def _apart(circle: Array, other: Array) -> float:
-    """Distance of the centres of circles (2, 2), over the smaller radius."""
+    """Distance between the centres of circles (2, 2), in units of the smaller radius."""
     radius = min(float(np.linalg.norm(x[1] - x[0])) for x in (circle, other))
     return float(np.linalg.norm(circle[0] - other[0])) / max(radius, 1.0)
 
@@ -377,7 +380,7 @@ def _alike(circle: Array, other: Array) -> bool:
 
 
 def _single(sighted: list[_Sighted]) -> list[_Sighted]:
-    """The best sighting of each body."""
+    """The detection of best quality for each body."""
     kept: list[_Sighted] = []
     for one in sorted(sighted, key=lambda x: -x.found.quality):
         if not any(_same_body(one, other) for other in kept):
@@ -386,13 +389,13 @@ def _single(sighted: list[_Sighted]) -> list[_Sighted]:
 
 
 def _same_body(one: _Sighted, other: _Sighted) -> bool:
-    """Whether two squares have found one body: landmarks together, or a box in that of the other.
+    """Whether two detections show one body: close landmarks, or one box inside the other.
 
-    Sides may be exchanged, and of the second kind colours must be alike.
+    Left and right may be exchanged. If only the boxes overlap, the colours must be similar.
     """
     sizes = sorted((one.sighting.size, other.sighting.size))
     if sizes[1] > LARGEST_RATIO * sizes[0]:
-        # A child before an adult is somebody else.
+        # A child in front of an adult is another person.
         return False
     first, second = (x.keypoints.pixels[_BODY] for x in (one, other))
     away = min(float(np.median(np.linalg.norm(first - x, axis=1))) for x in (second, second[_SWAP]))

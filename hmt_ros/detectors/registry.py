@@ -1,4 +1,4 @@
-"""All detectors of keypoints, by the names under which users choose them."""
+"""All keypoint detectors, by the names with which users select them."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from hmt_ros.detectors.blazepose import MEDIAPIPE
 from hmt_ros.detectors.detector import DetectorKind
 from hmt_ros.detectors.movenet import WITH_MOVENET
 
-# A new detector is a file beside this one and a line here.
+# A new detector needs a file in this folder and a line here.
 DETECTORS: dict[str, DetectorKind] = {
     'mediapipe': MEDIAPIPE,
     'mediapipe+movenet': WITH_MOVENET,
 }
-# The detector that is used unless another is named.
+# Default detector.
 USUAL_DETECTOR = 'mediapipe'
-# Detectors for uses without a time limit, the surest first.
+# Detectors for use without a time limit, most accurate first.
 _SUREST = ('mediapipe+movenet', USUAL_DETECTOR)
 
 
 def surest_detector() -> str | None:
-    """Name of the surest detector that is installed; None if none is installed."""
+    """Name of the most accurate installed detector; None if none is installed."""
     return next((name for name in _SUREST if DETECTORS[name].is_installed()), None)

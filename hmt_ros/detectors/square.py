@@ -1,4 +1,4 @@
-"""The square of an image that a network sees, and its output in that square."""
+"""Square crops of an image as inputs of networks, and mapping of their outputs to the image."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hmt_ros.core import elementary
 from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.inference.linear_algebra import product
 
-# Ratio of the square's side to the diameter of its content.
+# Ratio of a square's side to the diameter or extent of its content.
 _MARGIN = 1.25
 
 Float = TypeVar('Float', np.float32, np.float64)
@@ -31,7 +31,7 @@ class Square:
 
     @classmethod
     def about(cls, circle: Array) -> Square:
-        """The square around a circle, with the circle's point above the centre."""
+        """The square around a circle (2, 2), turned so that the circle's point is on top."""
         centre, (along, down) = circle[0], circle[1] - circle[0]
         side = 2 * _MARGIN * math.hypot(along, down)
         return cls((centre[0], centre[1]), side, float(elementary.arctan2(along, -down)))
@@ -45,7 +45,7 @@ class Square:
 
     @property
     def axes(self) -> Array:
-        """Unit vectors (2, 2) to the right and down in the square, in rows."""
+        """Unit vectors to the right and down in the square, in rows, (2, 2)."""
         c, s = float(elementary.cos(self.angle)), float(elementary.sin(self.angle))
         return np.array([[c, s], [-s, c]])
 
@@ -63,7 +63,7 @@ class Square:
         return np.asarray(result[..., ::-1], np.uint8)
 
     def spread(self, values: Values, size: tuple[int, int]) -> Values:
-        """The values (n, n) of the square, placed in an image of `size` (H, W)."""
+        """Values (n, n) of the square, mapped to an image of `size` (H, W)."""
         to_square = self.axes * (len(values) / self.side)
         matrix = np.column_stack([to_square, product(-to_square, self.corner)])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -72,6 +72,6 @@ class Square:
 
 def sigmoid(x: NDArray[Float]) -> NDArray[Float]:
     """The probabilities of logits."""
-    # Logits are clipped where exp would overflow.
+    # Clip logits so that exp does not overflow.
     result: NDArray[Float] = 1 / (1 + elementary.exp(-x.clip(-80, 80)))
     return result

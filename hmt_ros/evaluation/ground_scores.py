@@ -1,7 +1,7 @@
-"""Scores of feet against the true floor (sliding and depth below it), and of the vertical.
+"""Scores of feet (sliding, and depth below the true floor), and of the estimated vertical.
 
 The sliding of a foot is the speed of its ankle in the world between two frames in which the foot
-truly stands. Depths are those of ankles and toes below the true plane of the floor; the sole lies
+truly stands. Depth is measured from the true plane of the floor to ankles and toes. The sole lies
 some centimetres below the ankle, so that a pose that does not sink in has a depth of 0.
 """
 
@@ -17,7 +17,7 @@ from hmt_ros.inference.arrays import Array
 
 ANKLES = ('left_ankle', 'right_ankle')
 FEET = (*ANKLES, 'left_toe', 'right_toe')
-# Maximum depth below the floor of a joint that has not sunk in, m.
+# Maximum depth below the floor at which a joint does not count as sunk, m.
 SUNK = 0.02
 # Maximum interval between neighbouring frames, relative to the median interval.
 _GAP = 1.5
@@ -44,7 +44,7 @@ class TrueGround:
 
 @dataclass(frozen=True)
 class GroundScores:
-    """Scores of the feet of one pose per frame, such as the heaviest mode.
+    """Scores of the feet, from one pose per frame, such as the heaviest mode.
 
     Attributes:
         sliding: mean speed of standing ankles, m/s; None if no foot is known to stand.
@@ -77,12 +77,12 @@ class GroundScores:
 
 @dataclass(frozen=True)
 class GravityScores:
-    """Scores of the vertical of a track.
+    """Scores of the vertical that a track estimates.
 
     Attributes:
         error: median angle to the true vertical, rad.
-        said: median of the standard deviation about each horizontal axis that the track reports,
-            rad; NaN: not reported.
+        said: median of the standard deviation that the track reports for the vertical, about a
+            horizontal axis, rad; NaN: not reported.
         frames: number of frames.
     """
 
@@ -109,7 +109,7 @@ class GravityScores:
 def gravity_scores(
     ups: Mapping[int, tuple[Array, float]], truth: Mapping[int, TrueGround]
 ) -> GravityScores | None:
-    """Score a vertical; return None if no frame has a truth.
+    """Score an estimated vertical; return None if no frame has a true vertical.
 
     Args:
         ups: stamp in ns -> unit vector (3,) against gravity, camera frame, and its standard
@@ -127,7 +127,7 @@ def gravity_scores(
 def ground_scores(
     joints: Mapping[int, Array], names: Sequence[str], truth: Mapping[int, TrueGround]
 ) -> GroundScores | None:
-    """Score feet; return None if no frame has a truth, or there are no joints of feet.
+    """Score the feet; return None without a frame with a true floor, or without joints of feet.
 
     Args:
         joints: stamp in ns -> (J, 3) joint positions of one pose, m, camera frame.
@@ -155,7 +155,7 @@ def _sliding(
     names: Sequence[str],
     truth: Mapping[int, TrueGround],
 ) -> float | None:
-    """Return the mean speed of standing ankles, m/s; None if missing."""
+    """Return the mean speed of standing ankles, m/s; None if no foot is known to stand."""
     if len(stamps) < 2:
         return None
     usual = _GAP * float(np.median(np.diff(stamps)))

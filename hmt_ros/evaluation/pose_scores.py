@@ -6,10 +6,11 @@ pelvis. A component N(m, S) over poses becomes one over joint positions by linea
 
     N(f(m), J S J^T + D + s^2 I),   f: joints minus origin,   J = df/dx at m.
 
-The diagonal D has the variances of the errors that every pose of the body has, because its joints
-are not exactly those of the person (`Body.joint_errors`); published covariances of joints include
-it, too. Without D the density would be confined to a surface: 13 joints have 39 coordinates, which
-fewer degrees of freedom move. s is an additional standard deviation for evaluation, usually 0.
+The diagonal matrix D has the variances of errors that remain in every pose, as the joints of the
+body are not exactly those of the person (`Body.joint_errors`); published covariances of joints
+include D, too. Without D the density would be confined to a surface, because the 39 coordinates of
+13 joints depend on fewer degrees of freedom. s is an additional standard deviation for evaluation,
+usually 0.
 """
 
 from __future__ import annotations
@@ -51,9 +52,9 @@ ORIGIN = 'pelvis'
 HIPS = ('left_hip', 'right_hip')
 # Additional standard deviation of a coordinate (s above), m.
 MODEL_SIGMA = 0.0
-# Minimum of the mean joint error of the best component at which a frame counts as lost, m.
+# Minimum mean joint error of the best component at which a frame counts as lost, m.
 LOST = 0.15
-# Number of samples of a density for the estimate of a level.
+# Number of samples of a density from which a level is estimated.
 SAMPLES = 500
 # Number of mixtures whose kinematics are computed together.
 BATCH = 32
@@ -64,10 +65,10 @@ def origin_joints(names: Sequence[str], source: str = 'truth') -> tuple[str, ...
 
     Args:
         names: names of the joints whose true positions are known.
-        source: source of the positions, for the error.
+        source: name of the source of the positions, for the error.
 
     Raises:
-        ValueError: neither is known.
+        ValueError: neither the pelvis nor both hips are known.
     """
     for origin in ((ORIGIN,), HIPS):
         if set(origin) <= set(names):
@@ -105,7 +106,7 @@ class JointMixture:
     Attributes:
         weights: (K,) weights; they sum to 1.
         joints: (K, J, 3) joint positions, m.
-        covariances: (K, 3J, 3J) m^2; None if unknown.
+        covariances: (K, 3J, 3J) covariances of the coordinates, m^2; None if unknown.
 
     Raises:
         ValueError: shapes do not match, or values are not finite.
@@ -152,7 +153,7 @@ def joint_mixtures(
         mixtures: (T,) mixtures over poses (d,).
         names: (J,) names of the joints.
         model_sigma: additional standard deviation of a coordinate, m.
-        positions: for each mixture positions (K, J', 3) of all joints of the body at the means, m;
+        positions: (K, J', 3) positions, m, of all joints of the body at the means of each mixture;
             None: computed from the means.
         origin: joints whose mean position is the origin; empty: origin of the camera frame.
 
@@ -171,7 +172,7 @@ def joint_mixtures(
 
     own = np.diag(np.repeat(np.square(body.joint_errors[which]) + model_sigma**2, 3))
     result = []
-    # Kinematics in batches: frame by frame a pose would take ten times as long.
+    # Kinematics are computed in batches, ten times as fast as frame by frame.
     for first in range(0, len(mixtures), BATCH):
         batch = mixtures[first : first + BATCH]
         means = np.concatenate([mixture.means for mixture in batch])
@@ -204,8 +205,10 @@ class Scores:
         log_densities: (T,) log p(true joint positions), positions in m; None without covariances.
         levels: (T,) levels of the true positions of all joints together, see
             `inference.calibration`; None without covariances.
-        joint_levels: (T, J) levels of the true position of each joint alone; None likewise.
-        absolute_levels: (T, J) the same in the frame of the camera; None: unknown.
+        joint_levels: (T, J) levels of the true position of each joint by itself; None without
+            covariances.
+        absolute_levels: (T, J) levels of the true position of each joint by itself in the frame of
+            the camera; None if unknown.
     """
 
     names: tuple[str, ...]
@@ -239,7 +242,7 @@ class Scores:
         return Scores(tuple(names), errors, errors, errors, each, each, None, None, None)
 
     def summary(self) -> dict[str, Any]:
-        """Return means over the frames, errors in mm; None if the covariances are unknown.
+        """Return means over the frames, errors in mm; scores that need covariances may be None.
 
         Without frames the means are NaN.
         """
@@ -302,7 +305,7 @@ def marginal_regions(
     seed: int | np.random.Generator = 0,
     samples: int = SAMPLES,
 ) -> tuple[Array, Array]:
-    """Compute levels of the truth and volumes of the credible regions of each joint alone.
+    """Compute levels of the true positions and volumes of the credible regions, joint by joint.
 
     Args:
         mixtures: (T,) mixtures over positions of the same joints.

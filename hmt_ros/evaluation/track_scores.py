@@ -1,4 +1,4 @@
-"""Scores of a track, which is a mixture at each of many times, against the true joint positions.
+"""Scores of a track (one mixture at each of many times) against the true joint positions.
 
 Estimates are scored in batches as they arrive, so that memory for mixtures stays bounded. An
 estimate is compared with the truth of exactly its stamp.
@@ -28,9 +28,9 @@ from hmt_ros.evaluation.pose_scores import (
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.mixture import GaussianMixture
 
-# Minimum number of joints of a pose.
+# Minimum number of evaluated joints that a truth must have.
 _FEWEST_JOINTS = 4
-# Maximum distance of recorded joint positions from the kinematics of their body, m.
+# Maximum distance at which recorded joint positions agree with the kinematics of a body, m.
 _SAME_PLACE = 1e-3
 
 
@@ -39,7 +39,7 @@ class Truth:
     """True positions of the joints of a person.
 
     Attributes:
-        source: source of the truth, for errors.
+        source: name of the source, for texts of errors.
         joint_names: (J,) names of the joints.
         joints: stamp in ns -> (J, 3) m, camera optical frame.
         frame_id: frame of the positions; '' if unknown.
@@ -72,7 +72,7 @@ class Truth:
         """Return the joints of `EVALUATED_JOINTS` that the truth has.
 
         Raises:
-            ValueError: there are fewer than four.
+            ValueError: the truth has fewer than four of these joints.
         """
         known = tuple(name for name in EVALUATED_JOINTS if name in self.joint_names)
         if len(known) < _FEWEST_JOINTS:
@@ -85,7 +85,7 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A mixture over poses at one time, or the known part of it.
+    """A mixture over poses at one time, or those parts of the mixture that are known.
 
     Attributes:
         stamp_ns: time of the poses, ns.
@@ -110,9 +110,9 @@ class TrackScores:
 
     Attributes:
         kind: kind of its mixtures, e.g. 'posterior'.
-        scores: scores of the frames with a truth.
-        missing: number of true frames without an estimate.
-        without_truth: number of estimates without a truth.
+        scores: scores of the frames with ground truth.
+        missing: number of frames of the ground truth without an estimate.
+        without_truth: number of estimates at stamps without ground truth.
         note: reason for missing densities; '' if none are missing.
         ground: scores of the feet of the heaviest mode against the true floor; None if unknown.
     """
@@ -155,7 +155,7 @@ class TrackScorer:
         self._names: tuple[str, ...] = ()
 
     def take(self, estimate: Estimate) -> None:
-        """Adds a final estimate; of several with one stamp the first counts.
+        """Adds a final estimate; only the first estimate of each stamp is used.
 
         Raises:
             ValueError: the estimate lacks joints of the truth.
@@ -175,7 +175,7 @@ class TrackScorer:
             self._score_waiting()
 
     def take_window(self, estimates: Sequence[Estimate]) -> None:
-        """Adds the estimates of a window, by time; older estimates before it are final.
+        """Adds the estimates of a window, oldest first; estimates before the window become final.
 
         Raises:
             ValueError: see `take`.
@@ -189,7 +189,7 @@ class TrackScorer:
         """Return all scores.
 
         Raises:
-            ValueError: no estimate has a truth; see also `take`.
+            ValueError: no estimate has a stamp of the ground truth; see also `take`.
         """
         for stamp in sorted(self._window):
             self.take(self._window[stamp])
@@ -223,7 +223,7 @@ class TrackScorer:
             self._heaviest[estimate.stamp_ns] = estimate.body.joint_positions(means)[0]
 
     def _score_waiting(self) -> None:
-        """Scores the waiting estimates, which have the same body."""
+        """Scores the waiting estimates, which all have the same body."""
         estimates, self._waiting = self._waiting, []
         if not estimates:
             return

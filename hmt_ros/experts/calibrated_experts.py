@@ -2,10 +2,10 @@
 
     p(x | r) ~ sum_i g_i(r)^(1 / T) N(x; f_i(r), c_i(r) s (O_i + E))
 
-The frames of one motion are alike, so a model is too certain about any other motion: in many
-dimensions its gates decide too sharply, and its covariances are those of the motions it knows. The
+The frames of one motion are similar, so a model is overconfident about other motions: in high
+dimensions its gates are too sharp, and its covariances fit only the training motions. The
 temperature T of the gates, the added covariance E and the factor s are learned by
-`hmt_learning.training.calibration_learning`; here they are used.
+`hmt_learning.training.calibration_learning`; this module applies them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FOLDS = 3
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Changes the mixtures of a model.
+    """Correction of the gates and covariances of a model.
 
     Attributes:
         temperature: Temperature T of the gates, at least 1.
@@ -66,10 +66,10 @@ class Calibration:
 
 
 class CalibratedExperts(ConditionalDensity):
-    """A model whose gates and covariances are calibrated on motions left out; it only predicts.
+    """A model with gates and covariances calibrated on held-out motions; for prediction only.
 
     Args:
-        folds: Number of parts of the motions; each part is left out once.
+        folds: Number of cross-validation folds over the motions.
     """
 
     kind = 'calibrated_experts'
@@ -90,7 +90,7 @@ class CalibratedExperts(ConditionalDensity):
         return self.model.jacobians(inputs)
 
     def support(self, inputs: ArrayLike) -> Array:
-        """Support (n,) of the inputs (n, p) by training data; that of the model."""
+        """Similarity (n,) of inputs (n, p) to the training data, from the wrapped model."""
         return self.model.support(inputs)
 
     def _stored_parameters(self) -> dict[str, Any]:
@@ -99,7 +99,7 @@ class CalibratedExperts(ConditionalDensity):
     @classmethod
     def _constructed(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
         own = part('model', arrays)
-        # No nesting, because files could nest models without end.
+        # Refuse nesting, because a file could nest models without end.
         require(str(own['kind']) != cls.kind, 'a calibrated model inside a calibrated model')
         return cls(stored_model(own), **parameters_of(arrays))
 

@@ -1,4 +1,4 @@
-"""Conditional densities that are mixtures of Gaussians: the base of all models (BME 2.2).
+"""Base class of all models: conditional densities that are Gaussian mixtures (BME 2.2).
 
     p(x | r) = sum_i g_i(r) p_i(x | r)                                              (BME 10)
     p_i(x | r) = N(x; f_i(r), c_i(r) O_i)                                           (BME 12)
@@ -86,7 +86,7 @@ class ConditionalDensity(ABC):
     unchanged, learned attributes end in an underscore, `get_params` and `set_params` exist.
 
     Attributes:
-        kinds: All models by their names in files.
+        kinds: Classes of models by their names in files.
     """
 
     kind: ClassVar[str]
@@ -107,7 +107,7 @@ class ConditionalDensity(ABC):
 
         Raises:
             ValueError: shapes are wrong, values are not finite, there are too few samples, or the
-                model can not learn, such as a network outside hmt_learning.
+                model cannot be trained here, such as a network outside hmt_learning.
         """
         raise ValueError(f'{type(self).__name__} predicts only: it learns in hmt_learning')
 
@@ -121,9 +121,9 @@ class ConditionalDensity(ABC):
 
     @abstractmethod
     def support(self, inputs: ArrayLike) -> Array:
-        """Support (n,) of the inputs (n, p) by training data, from 0 to 1.
+        """Similarity (n,) of inputs (n, p) to the training data, from 0 to 1.
 
-        The largest kernel value at the input; near 0 the means are no better than a constant.
+        It is the largest kernel value at the input. Near 0 the means are no better than a constant.
         """
 
     @abstractmethod
@@ -180,10 +180,10 @@ class ConditionalDensity(ABC):
         return self
 
     def to_arrays(self) -> Arrays:
-        """The whole model as arrays, for a file of its own or as part of another.
+        """The whole model as arrays, for its own file or as part of another file.
 
         Raises:
-            ValueError: the model has not learned yet.
+            ValueError: the model has not been trained.
         """
         self._check_learned()
         shape = np.array([self.n_inputs_, self.n_outputs_])
@@ -247,12 +247,12 @@ class ConditionalDensity(ABC):
         check_covariances('noise', found.noise)
 
     def _stored_parameters(self) -> dict[str, Any]:
-        """The constructor's arguments that JSON can hold."""
+        """The constructor's arguments that are serialisable as JSON."""
         return self.get_params()
 
     @classmethod
     def _constructed(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
-        """The model of a file before its learned arrays are set."""
+        """Construct the model of a file, before its learned arrays are set."""
         return cls(**parameters_of(arrays))
 
     def _check_learned(self) -> None:

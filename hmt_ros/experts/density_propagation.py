@@ -37,17 +37,17 @@ def propagate(
     n_components: int | None = None,
     without_past: GaussianMixture | None = None,
 ) -> GaussianMixture:
-    """p(x_t | R_t) by rule (1).
+    """Compute p(x_t | R_t) by rule (1).
 
-    Previous components without support of the model give their weight to the prediction from the
-    observation alone; without any support, that prediction is the result.
+    Previous components at which the model has no training data pass their weight to the prediction
+    from the observation alone.
 
     Args:
         model: Model of p(x_t | x_{t-1}, r_t) with inputs (x_{t-1}, r_t), states first.
         previous: p(x_{t-1} | R_{t-1}) over states (d,).
         observation: r_t (q,); q may be 0.
-        n_components: Number of components M of the result; None takes the number of experts.
-        without_past: p(x_t | r_t); None trusts the model everywhere.
+        n_components: Number of components M of the result; None: the number of experts.
+        without_past: p(x_t | r_t), from the observation alone; None uses the model everywhere.
 
     Raises:
         ValueError: dimensions do not fit, or the observation is not finite.
@@ -75,7 +75,7 @@ def propagate(
 
 
 def joined(parts: Sequence[tuple[float, GaussianMixture]]) -> GaussianMixture:
-    """One mixture of all components, each mixture with its share of the weight."""
+    """Join mixtures into one; each has the given share of the weight."""
     mixtures = [one for _, one in parts]
     return GaussianMixture(
         np.concatenate([share * one.normalised().weights for share, one in parts]),

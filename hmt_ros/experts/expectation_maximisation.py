@@ -4,9 +4,9 @@ Every iteration raises the bound
 
     F = sum_i E_i(h) + G(h) - sum_n s_n sum_i h_ni log h_ni
 
-minus the variational free energy (BME 24). E_i is the evidence of expert i for responsibilities h
-(`sparse_bayes`), G the share of the gates (`gates`), s are the weights of the samples. The E-step
-takes an expectation over the weights W of the experts,
+which is minus the variational free energy (BME 24). E_i is the evidence of expert i for
+responsibilities h (`sparse_bayes`), G the part of the gates (`gates`), and s are the sample
+weights. The E-step takes an expectation over the weights W of the experts,
 
     h_ni ~ g_i(r_n) exp E_W log N(x_n; W_i' phi, O_i)                               (BME 13)
 
@@ -25,10 +25,10 @@ from hmt_ros.experts.sparse_bayes import SparseRegression, WeightedSums
 from hmt_ros.experts.training_pairs import TrainingPairs
 from hmt_ros.inference.arrays import Array, Index
 
-# An expert from its weighted sums and its previous state.
+# Function that learns an expert from its weighted sums and its previous state.
 Learner = Callable[[WeightedSums, SparseRegression | None], SparseRegression]
 
-# Number of samples below which an expert is empty; the largest expert is never empty.
+# Minimum number of samples of an expert that is kept; the largest expert is always kept.
 LEAST_SAMPLES = 2.0
 
 
@@ -49,7 +49,7 @@ class EMState:
     bound: float
 
     def without_others(self, kept: Index) -> EMState:
-        """Return the state with some of the experts."""
+        """Return the state with only the experts `kept`."""
         experts = tuple(self.experts[int(i)] for i in kept)
         return EMState(experts, self.gates.of_experts(kept), self.gate_features, -np.inf)
 

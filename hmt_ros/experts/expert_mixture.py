@@ -2,8 +2,8 @@
 
     p(x | r) = sum_i g_i(r) N(x; M_i' phi(r), O_i (1 + phi' S_i phi))           (BME 14 and 31)
 
-`ConditionalExperts` have softmax gates (BME 16), `JointExperts` Gaussian gates (BME 32). One expert
-is a sparse Bayesian regression, the baseline with a single mode (BME 3). All are learned by
+`ConditionalExperts` have softmax gates (BME 16), `JointExperts` Gaussian gates (BME 32). A model
+with one expert is sparse Bayesian regression, the single-mode baseline of BME 3. All are trained by
 `expectation_maximisation`.
 
 Several starts, each with all candidate kernel widths, run for a few iterations on a subset of the
@@ -55,14 +55,14 @@ if TYPE_CHECKING:
 
 # Candidate kernel widths, in typical distances between inputs.
 WIDTHS = (0.5, 1.0, 2.0)
-# Iterations of a start in each round of the selection, and maximum number of its samples.
+# Number of iterations in each round of the selection of a start; maximum number of its samples.
 TRIAL_ITERATIONS = (2, 4, 8)
 TRIAL_SAMPLES = 1000
-# Noise variance preferred by the prior, over the targets' variance.
+# Noise variance preferred by the prior, relative to the targets' variance.
 NOISE_FLOOR = 1e-2
-# Maximum numbers of experts, and of functions of an expert, in a file.
+# Maximum number of experts in a file, and of basis functions of an expert.
 MOST_EXPERTS, MOST_ACTIVE = 1000, 2000
-# Rounding error of the correlations of weights, whose covariances span many orders of magnitude.
+# Tolerance for rounding errors in correlations of weights: covariances vary by many orders.
 SEMIDEFINITE = 1e-6
 
 
@@ -74,16 +74,16 @@ class ExpertMixture(ConditionalDensity):
         basis: Basis functions of experts and gates: 'linear' or 'rbf' (Gaussian kernels).
         width: Width of the kernels, in scaled inputs; None chooses among candidates.
         max_kernels: Maximum number of candidate kernels, spread over the training inputs.
-        n_starts: Number of starts of EM for each width.
+        n_starts: Number of initialisations of EM for each width.
         tolerance: Gain of an iteration below which EM ends, nats per sample.
-        scaling: Scaling of inputs before distances are taken; see `Standardisation.of`.
+        scaling: Scaling of inputs before distances are computed; see `Standardisation.of`.
 
     Attributes:
         n_experts_: Number of experts that remain.
-        basis_: Candidate basis functions phi that an expert uses.
+        basis_: Basis functions phi that at least one expert uses.
         experts_: Regressions of the experts, in units of standardised targets.
         gates_: Gates of the experts.
-        bound_: F after each iteration since the last expert was pruned, nats, standardised targets.
+        bound_: Bound F, nats, after each iteration since the last pruning of an expert.
     """
 
     n_experts_: int
@@ -166,7 +166,7 @@ class ExpertMixture(ConditionalDensity):
         return flat.reshape(shape) * self._target_scaling.scale[:, None]
 
     def support(self, inputs: ArrayLike) -> Array:
-        """Largest kernel at each input, (n,); for linear experts exp(-|z|^2 / 2p)."""
+        """Largest kernel value at each input, (n,); for linear experts exp(-|z|^2 / 2p)."""
         points = self._scaling.apply(self._checked(inputs))
         if isinstance(self.basis_, RadialBasis):
             squares = squared_distances(points, self._candidates).min(1) / self.basis_.width**2
@@ -238,7 +238,7 @@ class ExpertMixture(ConditionalDensity):
     def _first_responsibilities(
         self, pairs: TrainingPairs, number: int, rng: np.random.Generator
     ) -> Array:
-        """Return responsibilities (N, M) from clusters of inputs and targets, weighted by start."""
+        """Responsibilities (N, M) from clusters; `number` sets the weight of inputs and targets."""
         inputs = self._scaling.apply(pairs.inputs)
         targets = self._target_scaling.apply(pairs.targets)
         share = (0.5, 0.7, 0.9, 0.3)[number % 4]
@@ -328,7 +328,7 @@ class ConditionalExperts(ExpertMixture):
 
 
 class JointExperts(ExpertMixture):
-    """The joint BME (BME 2.2.3): a mixture over inputs and targets together.
+    """The joint BME (BME 2.2.3): a mixture over inputs and targets jointly.
 
         p(x, r) = sum_i a_i N(r; m_i, C_i) N(x; W_i phi(r), O_i)                    (BME 33)
 

@@ -12,8 +12,9 @@ Both learn from responsibilities h (N, M) and never lower
 
     sum_n s_n sum_i h_ni log g_i(r_n) + penalty
 
-which is their part of the bound that EM raises. The penalty of the softmax is its log prior and
-the Laplace approximation of the integral over V; that of the Gaussians is an inverse Wishart prior.
+which is the gates' part of the bound that EM raises. The penalty of the softmax is its log prior
+plus the Laplace approximation of the integral over V. The penalty of the Gaussians is an inverse
+Wishart log prior.
 """
 
 from __future__ import annotations
@@ -43,10 +44,10 @@ from hmt_ros.inference.linear_algebra import inverse_triangular, product
 SHAPE, RATE = 1e-2, 1e-4
 # Lower bound of precisions; without it, a gate that grows ever sharper would never converge.
 LEAST_PRECISION = 1e-5
-# Effective number of parameters, over M, below which a function may be pruned.
+# Effective number of parameters per expert below which a basis function may be pruned.
 USELESS = 0.05
 DAMPING_LIMIT = 1e10
-NEWTON_STEPS = 3  # between two E-steps; the next M-step continues from there
+NEWTON_STEPS = 3  # of one fit; the next M-step continues from its result
 # Maximum number of kernels of new softmax gates; number of samples per kernel.
 GATE_KERNELS, SAMPLES_PER_KERNEL = 60, 15
 
@@ -222,7 +223,7 @@ class _Softmax:
         return weights
 
     def laplace(self, weights: Array, precisions: Array) -> _SoftmaxFit:
-        """Compute the part of the bound, with a Laplace approximation at the weights."""
+        """Gates' part of the bound, by a Laplace approximation at the weights."""
         experts, count = weights.shape
         likelihood, gates = self.likelihood(weights)
         hessian = self.curvature(gates)
@@ -295,7 +296,7 @@ class GaussianGates:
         return self.standardisation.apply(inputs)
 
     def log_scores(self, features: Array) -> Array:
-        """log a_i N(r; m_i, C_i), (n, M), not normalised over experts, of standardised r (n, p)."""
+        """log a_i N(r; m_i, C_i), (n, M), unnormalised over experts, at standardised r (n, p)."""
         whiteners, log_dets = self._whitening
         result = np.empty((len(features), len(self.means)))
         for i, mean in enumerate(self.means):

@@ -3,11 +3,12 @@
     E(x) = 1/2 sum_ja ((a' (J_j(x) - t) - m_ja) / s_ja)^2 + 1/2 sum_l |A_l P_l(x)|^2 / n_l^2
            + E_prior(x)
 
-J_j is joint j of the pose x, a the axes of the person's view, t the middle of the hips; P_l is
-landmark l, A_l the projection across the ray of its keypoint, whose noise is n_l. A closed form
-gives the start (`body.limb_angles`); linear least squares place it where the landmarks are seen;
-Newton's method within the limits gives the minimum, its Hessian the covariance. The distance of the
-person is hardly observable, so the spread of people's size is added along the line of sight.
+J_j is joint j of the pose x, a the axes of the camera that looks at the person, t the middle of the
+hips; P_l is landmark l, A_l the projection across the ray of its keypoint, n_l the noise of the
+keypoint. A closed form gives the initial pose (`body.limb_angles`), and linear least squares move
+it so that the landmarks lie near their rays. Newton's method within the limits finds the minimum;
+the inverse Hessian is the covariance. The distance of the person is hardly observable, so the
+spread of people's size is added along the line of sight.
 """
 
 from __future__ import annotations
@@ -39,20 +40,19 @@ AWAY = np.array([0.0, 0.0, 5.0])
 # Weight of the body's prior, for angles that lifted joints do not determine, such as twists.
 PRIOR_WEIGHT = 0.3
 ITERATIONS, TOLERANCE = 12, 0.05
-# Factor on deviations across the line of sight, which the keypoints themselves show, and scale of
-# the robust kernel of these, in standard deviations.
+# Factor on joint deviations across the line of sight, where keypoints are used directly; scale of
+# the robust kernel of keypoints, in standard deviations.
 ACROSS, KERNEL = 4.0, 4.0
 # Standard deviation of a landmark from its keypoint when the person is placed, m at the person.
 SEEN = 0.03
-# Factors on covariances, for correlated errors of keypoints and joints, and of joints of a person
-# of other lengths. Chosen on clips: regions of 90 % of single joints hold 88 %, of other lengths 80
-# %.
+# Factors on covariances: for correlated errors of keypoints and joints, and for unknown lengths of
+# the person. Chosen on clips: 90 % regions of single joints cover 88 %, with unknown lengths 80 %.
 TOGETHER, OF_LENGTHS = 4.0, 1.6
 # Relative standard deviation of the size of a person.
 KNOWN_SIZE, UNKNOWN_SIZE = 0.02, 0.06
-# Probabilities that a detector exchanges the sides of nothing, all, arms or legs throughout a
-# window. The latter three happen in 5, 3 and 3 % of the images of clips, but in up to half of the
-# images of some people; chosen so that 90 % regions of such people have a coverage of 80 %.
+# Probabilities that a detector exchanges no sides, all sides, only arms or only legs throughout a
+# window. The last three happen in 5, 3 and 3 % of the images of clips, but in up to half of the
+# images of some people. Chosen so that 90 % regions of such people have a coverage of 80 %.
 EXCHANGE_SHARES = np.array([0.8, 0.1, 0.05, 0.05])
 # Minimum distance of a person, m.
 NEAREST = 0.4
@@ -73,16 +73,16 @@ def lift_poses(
     """Estimate mixtures over poses from the keypoints of a sequence, without images.
 
     Args:
-        body: of the person, with the lengths as far as they are known.
+        body: body of the person, with the person's lengths if they are known.
         camera: static camera of the keypoints.
         stamps: (T,) times of the images, increasing, s.
         ups: (T, 3) unit vectors against gravity, camera frame; None: unknown.
         lengths_known: whether the lengths of the body are those of the person.
-        causal: whether images after each time are left out.
+        causal: whether each estimate ignores later images.
         scheme: scheme of the keypoints' names, see `keypoint_schemes`.
 
     Returns:
-        T mixtures, heaviest first; None where fewer than five landmarks are seen.
+        T mixtures, heaviest component first; None if fewer than five landmarks are seen.
 
     Raises:
         ValueError: the scheme is unknown, or the body lacks joints.
@@ -119,14 +119,14 @@ def poses_of(
     """Convert mixtures over lifted joints to mixtures over poses of a body.
 
     Args:
-        body: of the person, with lengths as far as they are known.
+        body: body of the person, with the person's lengths if they are known.
         lifted: N mixtures with the same joints and the same number of components.
-        rays: (N, L, 2) of the landmarks (`LANDMARKS`) at that time, x/z and y/z.
-        confidences: (N, L) of these; 0: not seen.
+        rays: (N, L, 2) rays x/z and y/z of the landmarks (`LANDMARKS`) in the same images.
+        confidences: (N, L) confidences of the landmarks; 0: not seen.
         size_spread: relative standard deviation of the person's size.
 
     Raises:
-        ValueError: the body lacks some of the joints, or the mixtures lack some of a whole pose.
+        ValueError: the body lacks some of the joints, or the mixtures lack joints of a whole pose.
     """
     if not lifted:
         return []
@@ -154,7 +154,7 @@ def poses_of(
 
 
 def _postures(body: Body, lifted: Sequence[LiftedPoses]) -> Array:
-    """Poses (N K, d) near the means, with the hips `AWAY`, in closed form."""
+    """Closed-form poses (N K, d) near the lifted means, with the hips at `AWAY`."""
     skeleton, joints = body.skeleton, lifted[0].joints
     means = np.concatenate([product(one.sized(skeleton), one.axes) for one in lifted]) + AWAY
     place = {name: means[:, j] for j, name in enumerate(joints)}
@@ -164,7 +164,7 @@ def _postures(body: Body, lifted: Sequence[LiftedPoses]) -> Array:
 def _fitted(
     body: Body, poses: Array, lifted: Sequence[LiftedPoses], rays: Array, confidences: Array
 ) -> tuple[Array, Array]:
-    """Minima from poses (M, d), and their covariances (M, d, d)."""
+    """Minimise the energy from poses (M, d); return poses and covariances (M, d, d)."""
     skeleton, joints = body.skeleton, lifted[0].joints
     which = skeleton.joint_index(joints)
     hips = body.joint_positions(poses)[:, skeleton.joint_index(HIPS)].mean(1)
@@ -175,7 +175,7 @@ def _fitted(
     whiten = axes[:, None] / deviations[..., None]
     carriers, offsets = skeleton.joint_segments[which], skeleton.joint_offsets[which]
     segments, local = _marks(body)
-    # Offsets of x and y from those of the ray, a z and b z, m.
+    # Maps a point (x, y, z) to its offsets from the ray, x - a z and y - b z.
     across = np.zeros((*confidences.shape, 2, 3))
     across[..., 0, 0] = across[..., 1, 1] = 1.0
     across[..., 2] = -rays
@@ -209,7 +209,7 @@ def _fitted(
 
 
 def _placed(body: Body, poses: Array, rays: Array, confidences: Array) -> tuple[Array, Array]:
-    """Poses (M, d) whose landmarks are seen along rays (M, L, 2); covariances of their places."""
+    """Move poses (M, d) so that landmarks lie near rays (M, L, 2); also covariances of roots."""
     places = forward(body.skeleton, poses).points(*_marks(body)).transpose(2, 0, 1)
     places = places - poses[:, None, :3]
     a, b = rays[..., 0], rays[..., 1]
@@ -229,7 +229,7 @@ def _placed(body: Body, poses: Array, rays: Array, confidences: Array) -> tuple[
 
 
 def _marks(body: Body) -> tuple[Index, Array]:
-    """Segments (L,) that carry the landmarks, and places (L, 3) in their frames, m."""
+    """Segments (L,) that carry the landmarks, and positions (L, 3) in their frames, m."""
     names, offsets = landmark_offsets(body)
     which = body.skeleton.joint_index(tuple(names))
     return body.skeleton.joint_segments[which], body.skeleton.joint_offsets[which] + offsets
@@ -239,8 +239,8 @@ class KeypointPredictor:
     """Predicts mixtures over the poses of one person, image by image; see `lift_poses`.
 
     Args:
-        body: of the person, with the lengths as far as they are known.
-        size_known: whether the body is as large as the person.
+        body: body of the person, with the person's lengths if they are known.
+        size_known: whether the body has the size of the person.
 
     Attributes:
         newest: time of the newest image, s.
@@ -256,7 +256,7 @@ class KeypointPredictor:
         self.newest = -math.inf
 
     def add(self, keypoints: Keypoints, stamp: float) -> None:
-        """Add the keypoints of the next image, at a time in s later than those before."""
+        """Add the keypoints of the next image; its time, s, is later than all previous times."""
         self._shown, self.newest = self._history.add(keypoints, stamp), stamp
 
     def predict(self, up: Array | None = None) -> GaussianMixture | None:

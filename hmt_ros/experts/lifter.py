@@ -1,20 +1,20 @@
-"""Experts that know depth: a mixture of poses from a window of keypoints (BME 2, other inputs).
+"""Mixture of experts that lifts a window of 2D keypoints to 3D poses (BME 2, other inputs).
 
     p(y | r) = sum_i g_i(r) N(y; f_i(r), diag s_i(r)^2)
 
-y are the joints of a person of usual lengths, relative to the middle of the hips, along the axes of
-a camera that looks at the person; r is a window of keypoints. Gates g, means f and deviations s are
-one network with shared layers [Bishop 1994], learned from motion capture with simulated cameras and
-detector errors (`keypoint_training`).
+y are the joint positions of a person of usual lengths, relative to the middle of the hips, in the
+frame of a camera that looks at the person; r is a window of keypoints. One network with shared
+layers [Bishop 1994] gives the gates g, means f and deviations s. It is trained on motion capture
+with simulated cameras and detector errors (`keypoint_training`).
 
     keypoints -> landmarks of all schemes -> rays -> the view of a camera that looks at the trunk
 
-A window has a slot for each of `TIMES`, relative to the image of the estimate; the nearest image
-fills it if it is near enough, so that any frame rate works. The inputs are the positions of the
-landmarks in the plane of a camera that looks at the trunk, divided by their extent, with
-confidences; the offset of each image from its time; the extent; and, where known, the direction
-against gravity in that camera and the proportions of the person. Where gravity is known, that
-camera is rolled upright, because the experts were trained on upright cameras only.
+A window has one slot for each of `TIMES`, relative to the image of the estimate. The nearest image
+fills the slot if its time differs by at most `NEAR`, so any frame rate works. The inputs are the
+positions of the landmarks in the plane of a camera that looks at the trunk, divided by their
+extent, with confidences; the time offset of each image from its slot; the extent; and, if known,
+the direction against gravity in that camera and the proportions of the person. If gravity is known,
+that camera is rolled upright, because the experts were trained on upright cameras only.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ from hmt_ros.inference.linear_algebra import product
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.inference.random_numbers import standard_normals
 
-# Times of a window relative to its image, s, and the largest offset of an image from each, s.
+# Slot times of a window relative to its image, s, and maximum offset of an image from each, s.
 TIMES = np.array([0.0, -0.067, -0.15, -0.3, -0.5, -0.8, 0.067, 0.15, 0.3, 0.5, 0.8])
 NEAR = np.array([0.02, *([0.045, 0.06, 0.09, 0.12, 0.17] * 2)])
 
@@ -90,7 +90,7 @@ TRUNK = np.array(
         for name in ('left_shoulder', 'right_shoulder', 'left_hip', 'right_hip', 'mid_hip')
     ]
 )
-# Joints of our bodies that may name a keypoint without a scheme.
+# Landmarks of body joints, for keypoints that are named after joints.
 OF_JOINTS = {'pelvis': 'mid_hip', 'neck': 'neck_base', 'head': 'centre_of_head'}
 # Lengths whose proportions are inputs; the rise of the shoulders is not among them.
 PROPORTIONED = (
@@ -114,7 +114,7 @@ MOST = 12
 LEAST_CONFIDENCE, FEWEST = 0.02, 5
 # Number of inputs of a window.
 INPUTS = len(TIMES) * (3 * len(LANDMARKS) + 2) + 5 + len(PROPORTIONED) + 1
-# Landmark (E, L) that replaces each one under each exchange of `terms.keypoints.EXCHANGED`.
+# Landmark (E, L) that each landmark becomes under each exchange in `terms.keypoints.EXCHANGED`.
 _ARM, _LEG = ('shoulder', 'elbow', 'wrist'), ('hip', 'knee', 'ankle', 'heel', 'toe')
 _GROUPS = [ARMS if x.endswith(_ARM) else LEGS if x.endswith(_LEG) else CENTRE for x in LANDMARKS]
 EXCHANGES = np.where(
@@ -130,7 +130,7 @@ class WindowInputs:
 
     Attributes:
         values: (N, p) inputs of the experts.
-        axes: (N, 3, 3) axes of the cameras that look at the persons, in rows, camera frame.
+        axes: (N, 3, 3) rows are the axes of a camera that looks at the person, camera frame.
         known: (N,) whether a person is seen in the image of the window.
     """
 
@@ -140,7 +140,7 @@ class WindowInputs:
 
 
 def log_ratios(usual: Body, lengths: Mapping[str, float]) -> Array:
-    """Logarithms (P,) of a person's lengths over the usual ones.
+    """Log ratios (P,) of a person's lengths to the usual lengths.
 
     Args:
         usual: body with the usual lengths.
@@ -159,7 +159,7 @@ def relative(usual: Body, logs: Array) -> Array:
 
 
 def proportions(usual: Body, lengths: Mapping[str, float]) -> Array:
-    """Proportions (P,) of a person: log lengths over the usual ones, less their mean."""
+    """Proportions (P,) of a person: log ratios to the usual lengths, minus their weighted mean."""
     return relative(usual, log_ratios(usual, lengths))
 
 
@@ -167,7 +167,7 @@ def places_of(keypoints: Keypoints, scheme: str = AUTO) -> list[int]:
     """Return the landmark (row of `LANDMARKS`) that each keypoint shows; -1 if none.
 
     Args:
-        keypoints: keypoints of a detector, or with the joint names of a body.
+        keypoints: keypoints of a detector, or keypoints with the joint names of a body.
         scheme: keypoint scheme of the detector; see `keypoint_schemes.scheme_of`.
 
     Raises:
@@ -195,7 +195,7 @@ def landmark_offsets(body: Body, names: Sequence[str] = LANDMARKS) -> tuple[list
 def filled(
     stamps: Array, at: Array, *, causal: bool
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_], Array]:
-    """Select the images that fill windows.
+    """Select an image for each of the S slots of N windows.
 
     Args:
         stamps: (T,) times of the images, increasing, s.
@@ -203,8 +203,8 @@ def filled(
         causal: whether images after the time of a window are left out.
 
     Returns:
-        (N, S) rows of the images, (N, S) whether they are near enough, (N, S) their times relative
-        to the windows, s.
+        Rows (N, S) of the images, whether each is near enough (N, S), and their times (N, S)
+        relative to the windows, s.
     """
     wanted = at[:, None] + TIMES
     right = np.clip(np.searchsorted(stamps, wanted), 1, max(len(stamps) - 1, 1))
@@ -225,7 +225,7 @@ def window_inputs(
     """Inputs of N windows of S images with L landmarks.
 
     Args:
-        rays: (N, S, L, 2) x / z and y / z of the rays of the landmarks; arbitrary where the
+        rays: (N, S, L, 2) x / z and y / z of the rays of the landmarks; arbitrary if the
             confidence is 0.
         confidences: (N, S, L) confidences from 0 (not seen) to 1.
         times: (N, S) times of the images relative to that of the window, s.
@@ -262,7 +262,7 @@ FOLDER = Path(__file__).resolve().parent / 'models'
 SHIPPED = 'keypoints'
 KIND = 'lifter'
 
-# Earliest time of a window, s. Minimum z of a ray: rays from beside the camera carry little.
+# Earliest time in a window, relative to its image, s; minimum z of unit rays as a divisor.
 EARLIEST, BEFORE = float((TIMES - NEAR).min()), 0.1
 # Standard deviation above which a keypoint is ignored, m at the person.
 ANYWHERE = 0.15
@@ -270,13 +270,13 @@ ANYWHERE = 0.15
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Network(Layers):
-    """The network of gates, means and deviations, with shared layers.
+    """Network with shared layers that gives gates, means and deviations.
 
-    The numbers after the layers are those of K + 6 J K: gates, means and log deviations.
+    Its K + 6 J K outputs are gates, means and log deviations, in this order.
 
     Attributes:
         mean, scale: (p,) mean and scale of the inputs.
-        middle: (J, 3) origin of the means, m.
+        middle: (J, 3) constant that is added to the means, m.
     """
 
     mean: Floats
@@ -298,7 +298,7 @@ class Network(Layers):
         return np.asarray((inputs - self.mean) / self.scale)
 
 
-# Scale of the means, m; log of the usual deviation, and the limits of the log, log m.
+# Scale of the means, m; log of the usual deviation, and limits of log deviations, log m.
 MEANS, SPREAD, SPREADS = 0.3, -2.5, (-5.0, 1.0)
 
 
@@ -306,7 +306,7 @@ class Lifter:
     """Predicts mixtures over whole poses from windows of keypoints.
 
     Args:
-        usual: body with the usual lengths, to which the joints belong.
+        usual: body with the usual lengths; it has all of the joints.
         notes: card of the file, serialisable as JSON.
     """
 
@@ -339,11 +339,11 @@ class Lifter:
         causal: bool,
         exchanges: Array | None = None,
     ) -> list[LiftedPoses | None]:
-        """Predict the mixtures at N times; None where no person is seen.
+        """Predict the mixtures at N times; None if no person is seen.
 
-        With `exchanges`, sum_e P(e) p(y | r with the sides exchanged by e): when a detector
-        exchanges the sides, the person looks as if facing the other way, and the window can not
-        decide which.
+        With `exchanges` the result is sum_e P(e) p(y | r with the sides exchanged by e). If a
+        detector exchanges the sides, the person seems to face the other way, and the keypoints
+        alone cannot show the error.
 
         Args:
             stamps: (T,) times of the images, increasing, s.
@@ -351,9 +351,9 @@ class Lifter:
             at: (N,) times of the estimates, s.
             ups: (N, 3) unit vectors against gravity, camera frame; None: unknown.
             person: proportions of the person; None: unknown.
-            causal: whether images after those times are left out.
+            causal: whether each estimate ignores later images.
             exchanges: (E,) probabilities of `EXCHANGES`; the `MOST` heaviest components are kept.
-                None: the sides of the keypoints are right.
+                None: the sides of the keypoints are correct.
         """
         rows, there, times = filled(stamps, at, causal=causal)
         n = len(at)
@@ -386,7 +386,7 @@ class Lifter:
         return log_softmax(gates[kept]), means[kept], deviations[kept]
 
     def to_arrays(self) -> Arrays:
-        """Return the arrays of a file; those of the network have half precision."""
+        """Return the arrays of a file; the weights of the network have half precision."""
         parameters = {
             'joints': list(self.joints),
             'landmarks': list(LANDMARKS),
@@ -448,7 +448,7 @@ def load_lifter(model: str = SHIPPED) -> Lifter:
     return _loaded(path, path.stat().st_mtime_ns)
 
 
-# Cached, because each of several tracks loads one.
+# Cached, because each track loads the lifter.
 @lru_cache(maxsize=4)
 def _loaded(path: Path, _changed_ns: int) -> Lifter:
     return Lifter.load(path)
@@ -466,7 +466,7 @@ class KeypointHistory:
         """Add the keypoints of the next image and return their `landmark_rays`.
 
         Args:
-            stamp: time of the image, s; later than those before.
+            stamp: time of the image, s; later than all previous times.
         """
         rays, confidences = landmark_rays(self._camera, keypoints)
         recent = [one for one in self._seen if one[0] >= stamp + EARLIEST]

@@ -11,7 +11,7 @@ over the K nearest training inputs. `LocalExperts` finds modes among the targets
 The neighbours have the weights w_n of a Gaussian kernel. Their targets are clustered, and each
 cluster is an expert. Its gate is the share of the kernel in the cluster; its mean is the kernel
 regression over the cluster. Local experts fit maps with many folds better than a few global
-experts, at the price of keeping the training set.
+experts, at the cost of storing the training set.
 
 In both, O is the covariance of the leave-one-out residuals of training targets.
 """
@@ -36,14 +36,14 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-BATCH = 256  # inputs whose neighbours are searched together
-RIDGE = 1e-6  # share of the targets' variance that is added to the covariance
-# Minimum distance over the spacing; without it, one neighbour could have all the weight.
+BATCH = 256  # number of inputs whose neighbours are searched together
+RIDGE = 1e-6  # share of the targets' variance added to the covariance
+# Minimum distance relative to the spacing, so that no single neighbour gets all the weight.
 CLOSEST = 1e-3
-# Minimum spacing of samples, in scaled inputs; samples may coincide.
+# Minimum spacing of samples, in scaled inputs, because samples may coincide.
 LEAST_SPACING = 1e-9
 SWEEPS = 8  # maximum number of iterations of the clustering
-LEFT_OUT = 600  # training samples whose residuals give the covariance of local experts
+LEFT_OUT = 600  # number of training samples for the covariance of local experts
 FAINT = 1e-12  # weight of an expert without neighbours
 MOST = 1000  # maximum number of neighbours, and of experts, in a file
 
@@ -53,15 +53,15 @@ class _NeighbourModel(ConditionalDensity):
 
     Attributes:
         inputs_, targets_, sample_weight_: (N, p), (N, D), (N,) of the training set.
-        noise_: (D, D) O.
-        spacing_: Typical distance of a training input to its neighbours, scaled.
+        noise_: (D, D) covariance O.
+        spacing_: Typical distance of a training input to its neighbours, in scaled inputs.
     """
 
     n_neighbours: int
     scaling: str
     noise_: Array
     spacing_: float
-    # Precision of inputs and targets, and of weights, in files.
+    # Types of inputs and targets, and of weights, in files.
     _stored: tuple[DTypeLike, DTypeLike] = (np.float64, np.float64)
 
     def _keep_pairs(self, pairs: TrainingPairs) -> Array:
@@ -87,9 +87,9 @@ class _NeighbourModel(ConditionalDensity):
         return self._nearest(self._standardisation.apply(self._checked(inputs)), count)
 
     def _nearest(self, points: Array, count: int) -> tuple[Array, Index]:
-        """Do the same for standardised inputs.
+        """Distances and rows (n, count) of the samples nearest to standardised inputs (n, p).
 
-        In the high dimension of descriptors, no tree is faster than a full search.
+        All distances are computed: in the high dimension of descriptors, no tree is faster.
         """
         distances, rows = np.empty((len(points), count)), np.empty((len(points), count), np.intp)
         for i in range(0, len(points), BATCH):
@@ -137,10 +137,10 @@ class NearestNeighbours(_NeighbourModel):
 
     Args:
         n_neighbours: Number of neighbours K, less than the number of samples.
-        scaling: Scaling of inputs before distances are taken; see `Standardisation.of`.
+        scaling: Scaling of inputs before distances are computed; see `Standardisation.of`.
 
     Attributes:
-        spacing_: Root mean squared distance of a training input to its K neighbours, scaled.
+        spacing_: Root mean squared distance of an input to its K neighbours, in scaled inputs.
     """
 
     kind = 'nearest_neighbours'
@@ -152,7 +152,7 @@ class NearestNeighbours(_NeighbourModel):
     def fit(
         self, inputs: ArrayLike, targets: ArrayLike, sample_weight: ArrayLike | None = None
     ) -> Self:
-        """Keeps the samples; see `ConditionalDensity.fit`."""
+        """Store the samples; see `ConditionalDensity.fit`."""
         require(self.n_neighbours >= 1, f'n_neighbours is {self.n_neighbours}, wanted at least 1')
         pairs = checked_pairs(
             inputs,
@@ -163,7 +163,7 @@ class NearestNeighbours(_NeighbourModel):
         )
         ridge = self._keep_pairs(pairs)
         distances, index = self._nearest(self._scaled, self.n_neighbours + 1)
-        # A sample is its own neighbour, though not always the first where inputs are equal.
+        # A sample is its own neighbour, but not always the first one if inputs are equal.
         own = index == np.arange(len(pairs))[:, None]
         own[~own.any(1), -1] = True
         shape = (len(pairs), self.n_neighbours)
@@ -184,7 +184,7 @@ class NearestNeighbours(_NeighbourModel):
         return Components(elementary.log(shares), self.targets_[index], np.ones_like(shares), noise)
 
     def jacobians(self, inputs: ArrayLike) -> Array:
-        """Zeros (n, K, D, p): the neighbours' targets do not move with the input."""
+        """Zeros (n, K, D, p): the neighbours' targets do not depend on the input."""
         points = self._checked(inputs)
         return np.zeros((len(points), self.n_neighbours, self.n_outputs_, self.n_inputs_))
 
@@ -202,15 +202,15 @@ class NearestNeighbours(_NeighbourModel):
 class LocalExperts(_NeighbourModel):
     """Kernel regression in each mode of the neighbours' targets.
 
-    Targets are compared in their own metric: scale them before.
+    Distances between targets are Euclidean, so callers scale the targets first.
 
     Args:
-        n_experts: Maximum number of modes M of an input.
+        n_experts: Maximum number of modes M at an input.
         n_neighbours: Number of neighbours K, less than the number of samples.
         width_neighbour: Rank of the neighbour whose distance is the kernel width.
 
     Attributes:
-        spacing_: Root mean squared distance of a training input to its nearest one, scaled.
+        spacing_: Root mean squared distance of an input to its nearest neighbour, in scaled inputs.
     """
 
     kind = 'local_experts'
@@ -234,7 +234,7 @@ class LocalExperts(_NeighbourModel):
     def fit(
         self, inputs: ArrayLike, targets: ArrayLike, sample_weight: ArrayLike | None = None
     ) -> Self:
-        """Keeps the samples; see `ConditionalDensity.fit`."""
+        """Store the samples; see `ConditionalDensity.fit`."""
         require(
             1 <= self.width_neighbour <= self.n_neighbours and self.n_experts >= 1,
             f'n_experts {self.n_experts}, n_neighbours {self.n_neighbours}, width_neighbour '
@@ -284,11 +284,11 @@ class LocalExperts(_NeighbourModel):
     def _modes(self, distances: Array, index: Index) -> tuple[Array, Array, Array, Array]:
         """Cluster the neighbours (n, K) of n inputs.
 
-        K-means with the weights of the kernel, for all inputs at once; scipy's has no weights.
+        K-means weighted by the kernel, for all inputs at once; scipy's k-means has no weights.
 
         Returns:
             Weights (n, M) that sum to 1, heaviest first; means (n, M, D); shares (n, M, K) of the
-            neighbours in the means; widths (n,) of the kernels.
+            neighbours in each mean; widths (n,) of the kernels.
         """
         n, count = distances.shape
         width = np.maximum(distances[:, self.width_neighbour - 1], 1e-9)
@@ -301,8 +301,8 @@ class LocalExperts(_NeighbourModel):
         between = (
             squared[:, :, None] + squared[:, None] - product(2.0 * targets, targets.swapaxes(1, 2))
         )
-        # Seeds: the nearest neighbour, then repeatedly the maximum of weight times squared
-        # distance.
+        # Seeds: the nearest neighbour, then repeatedly the neighbour with the largest weight times
+        # squared distance to the seeds.
         rows = np.arange(n)
         nearest = between[rows, 0]
         owner = np.zeros((n, count), dtype=np.intp)

@@ -1,13 +1,13 @@
-"""Experts of one network: gates, means and widths of all from the same layers [Bishop 1994].
+"""Experts from one network, whose layers give all gates, means and widths [Bishop 1994].
 
     p(x | r) = sum_i g_i(r) N(x; f_i(r), c_i(r) O_i)                       (BME 10 and 12)
 
-A kernel model keeps samples and grows with them. The size of a network is constant, so it can learn
-from all motions in views from all directions. Here c_i may be below 1: an expert itself predicts
-how certain it is.
+A kernel model stores samples and grows with them. The size of a network is constant, so it can
+learn from all motions in views from all directions. Here c_i can be below 1, because each expert
+predicts its own uncertainty.
 
-`hmt_learning.training.network_learning` trains it. `Layers` have leaky units and residual
-connections.
+`hmt_learning.training.network_learning` trains the network. `Layers` have leaky rectified units and
+residual connections.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from hmt_ros.inference.linear_algebra import product
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# Limits of log sqrt(c).
+# Maximum of |log sqrt(c)|.
 WIDTHS = 2.0
 LEAK = 0.1  # slope of a unit below 0
-# Maximum number of layers in a file, size of whitened inputs, and size of the outputs for these.
+# Limits of a file: number of layers, size of whitened inputs, and size of the outputs for these.
 MOST_LAYERS, LARGEST_INPUT, LARGEST_OUTPUT = 100, np.float32(100.0), 1e15
 
 Floats = NDArray[np.float32]
@@ -58,18 +58,18 @@ class Layers:
     last_bias: Floats
 
     def outputs(self, inputs: Floats) -> Floats:
-        """The numbers (N, O) at inputs (N, p) that are whitened."""
+        """Outputs (N, O) at whitened inputs (N, p)."""
         return np.asarray(product(self.features(inputs), self.last) + self.last_bias)
 
     def features(self, inputs: Floats) -> Floats:
-        """The units (N, H) of the last layer at inputs (N, p) that are whitened."""
+        """Units (N, H) of the last layer at whitened inputs (N, p)."""
         units = _leaky(product(inputs, self.first) + self.first_bias)
         for weights, bias in zip(self.hidden, self.hidden_biases, strict=True):
             units = units + _leaky(product(units, weights) + bias)
         return units
 
     def jacobians(self, inputs: Floats, which: slice | Index) -> Floats:
-        """Derivatives (N, o, p) of some of the numbers by inputs (N, p) that are whitened."""
+        """Derivatives (N, o, p) of some outputs with respect to whitened inputs (N, p)."""
         before = product(inputs, self.first) + self.first_bias
         units = _leaky(before)
         slopes = _slopes(before)[:, :, None] * self.first.T
@@ -80,7 +80,7 @@ class Layers:
         return np.asarray(product(self.last[:, which].T, slopes))
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays for a file: in half precision, except single rows."""
+        """Arrays for a file: matrices in half precision, vectors in single precision."""
         return {
             name: np.asarray(value, dtype=np.float16 if value.ndim > 1 else np.float32)
             for name, value in vars(self).items()
@@ -88,15 +88,15 @@ class Layers:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], p: int) -> Self:
-        """The layers that `to_arrays` stored, of p inputs.
+        """The layers with p inputs that `to_arrays` stored.
 
         Raises:
-            KeyError, ValueError: arrays are missing, do not fit, or have outputs without bounds.
+            KeyError, ValueError: arrays are missing, do not fit, or allow too large outputs.
         """
         own = {name: np.asarray(arrays[name], np.float32) for name in cls.__dataclass_fields__}
         m = len(own['hidden'])
         require(m <= MOST_LAYERS, f'it has {m} hidden layers, wanted at most {MOST_LAYERS}')
-        # No output is larger than that of the sizes of all weights for the largest inputs.
+        # The network of absolute weights, at the largest inputs, bounds all outputs.
         bound = cls(**{name: np.abs(values) for name, values in own.items()})
         largest = bound.outputs(np.full((1, p), LARGEST_INPUT)).max()
         require(largest <= LARGEST_OUTPUT, f'its outputs may be larger than {LARGEST_OUTPUT:g}')
@@ -107,11 +107,11 @@ class NetworkExperts(ConditionalDensity):
     """Experts that share the layers of one network.
 
     Args:
-        units, layers: Width of the layers, and number of those that add to the first.
-        jitter: Standard deviation of the noise on inputs in training, over that of the inputs.
+        units, layers: Units of a layer, and number of residual layers after the first.
+        jitter: Standard deviation of the input noise in training, relative to that of the inputs.
 
     Attributes:
-        noise_: (M, D, D) O.
+        noise_: (M, D, D) covariances O.
     """
 
     kind = 'network_experts'
@@ -150,10 +150,10 @@ class NetworkExperts(ConditionalDensity):
         """Set the results of training.
 
         Args:
-            layers: with the outputs gates (M), log widths (M) and means (M D).
-            of_inputs, of_targets: before and after the layers; targets have one scale.
-            noise: (M, D, D) O.
-            centres, spacing: (C, p) clusters of the inputs, and the spread of one.
+            layers: layers whose outputs are gates (M), log widths (M) and means (M D).
+            of_inputs, of_targets: standardisations; all target columns share one scale.
+            noise: (M, D, D) covariances O.
+            centres, spacing: (C, p) centres of clusters of inputs, and the spread of a cluster.
         """
         self._layers, self._of_inputs, self._of_targets = layers, of_inputs, of_targets
         self.noise_, self._centres, self._spacing = noise, centres, spacing
@@ -179,7 +179,7 @@ class NetworkExperts(ConditionalDensity):
         return np.asarray(self._of_targets.scale[0] * slopes / self._of_inputs.scale)
 
     def support(self, inputs: ArrayLike) -> Array:
-        """exp(-(d / 2 s)^2 / 2), (n,): d to the nearest cluster of inputs, s the spread of one."""
+        """exp(-(d / 2 s)^2 / 2), (n,), for the distance d to the nearest cluster, of spread s."""
         seen = self._of_inputs.apply(self._checked(inputs))
         away = squared_distances(seen, self._centres).min(1)
         return np.asarray(elementary.exp(-0.5 * away / (2.0 * self._spacing) ** 2))

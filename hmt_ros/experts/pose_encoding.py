@@ -1,11 +1,11 @@
-"""The encoding of poses as targets for experts: relative to the view, without wrap-around.
+"""Encoding of poses as targets of experts: relative to the view, without wrap-around of angles.
 
 A target has D = 6 + A numbers. The first six are the front axis and the up axis of the pelvis, in
-the frame of the viewing ray: the camera at the level of the body, turned so that its optical axis
-meets the pelvis. A posture then has the same target everywhere in the image, and a turning person
-does not jump from +180 to -180 degrees. The other numbers are the A joint angles, whose limits span
-less than a turn. The position of the person is not part of the target, because the shape of a
-silhouette does not show it; see `root_placement`.
+the frame of the viewing ray: the levelled camera, turned so that its optical axis points at the
+pelvis. A posture then has the same target everywhere in the image, and the target of a turning
+person does not jump from +180 to -180 degrees. The other numbers are the A joint angles, whose
+limits span less than a turn. The position of the person is not part of the target, because the
+shape of a silhouette does not show it; see `root_placement`.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from hmt_ros.inference.linear_algebra import product, pseudo_inverse
 AXES = 6
 ROOT = ('root_tx', 'root_ty', 'root_tz')
 TURNS = ('root_z', 'root_y', 'root_x')
-# Minimum length of an axis in its derivatives: a mean over opposite headings is a short vector,
-# whose direction carries little information.
+# Minimum length of an axis in derivatives. The mean over opposite headings is a short vector, and
+# its direction carries little information.
 SHORTEST = 0.1
 # Next and previous coordinate of each one, cyclically.
 NEXT, LAST = [1, 2, 0], [2, 0, 1]
-STEEPEST = np.radians(86.0)  # limit of the middle root angle, near which the other two coincide
+STEEPEST = np.radians(86.0)  # limit of the middle root angle; at 90 degrees the other axes align
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +76,8 @@ class PoseEncoding:
     def decode(self, targets: ArrayLike, roots: ArrayLike) -> Array:
         """Poses (N, d) of targets (N, D) with roots (N, 3) in the camera frame, m.
 
-        The axes are made perpendicular, the front axis first. Joint angles are clipped to the
-        limits of the body.
+        The up axis is made perpendicular to the front axis. Joint angles are clipped to the limits
+        of the body.
         """
         targets, roots = self._checked(targets, roots)
         poses = np.empty((len(targets), self.body.dimension))
@@ -96,7 +96,7 @@ class PoseEncoding:
         targets, roots = self._checked(targets, roots)
         n, d = len(targets), self.body.dimension
         poses = self.decode(targets, roots)
-        # Root angles from a small rotation: the inverse of the axes of the angles.
+        # From a small rotation to root angles: the inverse of the matrix of their axes.
         axes = forward(self.body.skeleton, poses).axes[3:AXES].transpose(2, 1, 0)  # (N, 3, angle)
         from_rotation = pseudo_inverse(axes, float(elementary.cos(STEEPEST)) / 2)
         by_target, by_root = np.zeros((n, d, d)), np.zeros((n, d, 3))
@@ -117,7 +117,7 @@ class PoseEncoding:
         to_ray = self._from_view(poses[:, :3]).transpose(0, 2, 1)
         axes = forward(self.body.skeleton, poses).axes[3:AXES].transpose(2, 1, 0)  # (N, 3, angle)
         turned = root_rotations(self.body, poses)  # camera frame
-        # The frame of the ray turns with the root, so in it an axis turns back.
+        # The frame of the ray turns as the root moves; in this frame, axes turn the other way.
         turns = np.concatenate([-self._view_by_root(poses[:, :3]), axes], axis=2)
         for k in range(2):  # front and up
             moved = np.cross(turns, turned[:, :, k + 1, None], axis=1)
@@ -126,12 +126,12 @@ class PoseEncoding:
         return result
 
     def _from_view(self, points: Array) -> Array:
-        """Rotations (N, 3, 3) from a camera that looks at points (N, 3), upright by the level."""
+        """Rotations (N, 3, 3) from a levelled camera looking at points (N, 3) to the camera."""
         level = self.body.level
         return np.asarray(product(level, ray_rotations(product(points, level))))
 
     def _view_by_root(self, points: Array) -> Array:
-        """Derivatives (N, 3, 3) of that rotation by the points, camera frame."""
+        """Derivatives (N, 3, 3) of `_from_view` with respect to the points, camera frame."""
         level = self.body.level
         return np.asarray(
             product(product(level, _rotation_by_root(product(points, level))), level.T)
@@ -166,7 +166,7 @@ def ray_rotations(points: Array) -> Array:
 
 
 def _rotation_by_root(points: Array) -> Array:
-    """Derivatives (N, 3, 3) of the rotation of the ray's frame by points (N, 3), camera frame."""
+    """Derivatives (N, 3, 3) of `ray_rotations` with respect to points (N, 3), camera frame."""
     distance = np.linalg.norm(points, axis=1)
     direction = points / distance[:, None]
     a, b, c = direction.T
@@ -181,7 +181,7 @@ def _rotation_by_root(points: Array) -> Array:
     ]
     change = np.array([by_a, by_b, by_c]).transpose(3, 0, 1, 2)  # (N, component, 3, 3)
     skew = product(change, ray_rotations(points)[:, None].transpose(0, 1, 3, 2))
-    # A direction keeps its length: only changes across it count.
+    # A unit vector only changes perpendicular to itself.
     across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
     across /= distance[:, None, None]
     skew = np.einsum('ncij,ncd->ndij', skew, across)
@@ -189,7 +189,7 @@ def _rotation_by_root(points: Array) -> Array:
 
 
 def _orthogonal(axes: Array) -> Array:
-    """Rotations (N, 3, 3) whose second and third columns are those of axes (N, 6)."""
+    """Rotations (N, 3, 3) with columns 2 and 3 from front and up axes (N, 6)."""
     front = _unit(axes[:, :3])
     up = axes[:, 3:] - (axes[:, 3:] * front).sum(1, keepdims=True) * front
     up = _unit(up)
@@ -199,7 +199,7 @@ def _orthogonal(axes: Array) -> Array:
 
 
 def _rotation_by_axes(axes: Array) -> Array:
-    """Derivatives (N, 3, 6) of the rotation of axes (N, 6), in the frame of the axes."""
+    """Derivatives (N, 3, 6) of `_orthogonal` with respect to axes (N, 6), in the ray's frame."""
     front, up = axes[:, :3], axes[:, 3:]
     frame = _orthogonal(axes)
     y, z = frame[:, :, 1], frame[:, :, 2]
@@ -209,7 +209,7 @@ def _rotation_by_axes(axes: Array) -> Array:
     dy = across / np.maximum(np.linalg.norm(front, axis=1), SHORTEST)[:, None, None]
     along = (up * y).sum(1)[:, None, None]
     rest = np.linalg.norm(up - along[:, :, 0] * y, axis=1)
-    # d(up - (up y) y): by the front through y, and by the up axis itself.
+    # d(up - (up y) y) with respect to the front axis, through y, and to the up axis.
     by_front = -(y[:, :, None] * product(up[:, None, :], dy)) - along * dy
     flat = eye - z[:, :, None] * z[:, None, :]
     flat /= np.maximum(rest, SHORTEST)[:, None, None]
@@ -227,7 +227,7 @@ def _rotation_by_axes(axes: Array) -> Array:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Cross products (..., 3); four times as fast as numpy's for a few of them."""
+    """Cross products (..., 3); four times as fast as numpy's for few vectors."""
     return np.asarray(a[..., NEXT] * b[..., LAST] - a[..., LAST] * b[..., NEXT])
 
 

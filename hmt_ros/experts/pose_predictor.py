@@ -3,8 +3,8 @@
     mask, image -> centred view -> descriptor -> experts -> mixture over targets
     mask -> bounding box -> root of each component -> mixture over poses
 
-One object and one file hold everything that is learned. Rule (1) (BME 2.1) can propagate the
-mixture of the image before, with a model of p(x_t | x_t-1, r_t) trained for one time step.
+One object and one file contain everything that is learned. Rule (1) (BME 2.1) can propagate the
+mixture of the previous image, by a model of p(x_t | x_t-1, r_t) trained for one time step.
 """
 
 from __future__ import annotations
@@ -69,13 +69,13 @@ LIGHTEST = 1e-3  # weight below which a component is dropped
 # Rate of the training sequences of rule (1), Hz, and their time step, s.
 RATE = 30.0
 STEP = 1.0 / RATE
-JITTER = 1e-9  # variance that is added to poses, m^2 and rad^2
+JITTER = 1e-9  # variance added to each coordinate of poses, m^2 and rad^2
 # Ways to propagate a mixture: by rule (1), or not at all.
 BY_EXPERTS, ALONE = 'experts', 'none'
 PROPAGATIONS = (BY_EXPERTS, ALONE)
-# Rate at which the past is taken for wrong, 1/s, so that a lost track recovers. Chosen by hand.
+# Rate at which the past is discarded, 1/s, so that a lost track recovers. Chosen by hand.
 FORGETTING = 5.0
-# Maximum condition number of a target basis; maximum deviation of an offset from the usual one, m.
+# Maximum condition number of a target basis; maximum deviation of a short length from usual, m.
 WORST_CONDITION, OFFSET = 1e12, 0.06
 
 
@@ -85,8 +85,8 @@ class Prediction:
 
     Attributes:
         mixture: Mixture over poses, heaviest component first.
-        place: Person in the image; its remarks are for the user.
-        support: Support of the silhouette by training data, from 0 to 1.
+        place: Person in the image, with remarks for the user.
+        support: Similarity of the silhouette to the training data, from 0 to 1.
     """
 
     mixture: GaussianMixture
@@ -99,8 +99,8 @@ class PosePredictor:
 
     Args:
         model: Trained model of p(z | descriptor).
-        target_basis: (D, D) B; models learn z = B' x of a target x.
-        equilibrium: p(x) of targets, a mixture of one component.
+        target_basis: (D, D) matrix B; the models predict z = B' x instead of a target x.
+        equilibrium: Prior p(x) of targets, a mixture with one component.
         dynamics: Trained model of p(z | previous z, descriptor), or None.
         notes: Card of the file, serialisable as JSON.
 
@@ -186,9 +186,9 @@ class PosePredictor:
             previous: Previous mixture over poses, to be propagated; None to use the image alone.
             interval: Time since `previous`, s.
             propagation: one of `PROPAGATIONS`.
-            max_components: Maximum number of components of the mixture; the heaviest stay.
+            max_components: Maximum number of components; the heaviest are kept.
             size_spread: Relative standard deviation of the person's size; 0 if the body has the
-                lengths of the person.
+                person's lengths.
             image: (H, W, 3) BGR image, for edges inside the mask; None: unknown.
 
         Raises:
@@ -259,10 +259,10 @@ class PosePredictor:
             raise ValueError(f'no propagation {propagation!r}, wanted one of {PROPAGATIONS}')
         if self.dynamics is None:
             raise ValueError('the predictor has no model for rule (1): train it with --dynamics')
-        # Beyond the step that the model has learned, poses follow the motion prior of the body.
+        # The model predicts over one `STEP`; the motion prior of the body covers the time before.
         before = self._to_targets(self._expected(previous, max(interval - STEP, 0.0)))
-        # Where experts are steep, the covariance would grow without bound from step to step; it is
-        # kept below that of p(x).
+        # Steep experts would let the covariance grow without bound from step to step, so it is kept
+        # below that of p(x).
         known = inverse(before.covariances) + inverse(self.equilibrium.covariances)
         before = GaussianMixture(before.weights, before.means, inverse(known))
         after = propagate(
@@ -324,7 +324,7 @@ class PosePredictor:
 
         Raises:
             ValueError, LookupError, TypeError: arrays or parameters are missing or wrong, or the
-                body is another one.
+                body differs.
         """
         parameters = parameters_of(arrays)
         if body is None:
@@ -355,7 +355,7 @@ class PosePredictor:
         )
 
     def answer(self, given: Array) -> GaussianMixture:
-        """Return the mixture over targets (D,) for the parts of a silhouette, by any dynamics."""
+        """Mixture over targets (D,) from silhouette parts; uses the dynamics if available."""
         contexts, *others = np.split(given, np.cumsum([-FIXED, PAIR_BINS, MAP * MAP, MOMENTS]))
         parts = SilhouetteParts(contexts.reshape(-1, RADIAL * ANGULAR), *others)
         row = self.descriptor.describe([parts])[0]
@@ -367,7 +367,7 @@ class PosePredictor:
     def save(self, path: str | Path) -> Path:
         """Write the predictor to an .npz file, with its notes as the card, and return its path."""
         read = partial(self.from_arrays, body=self.body)
-        # Most values of the parts of a silhouette lie between 0 and 1.
+        # Random numbers from 0 to 1, because most values of silhouette parts are.
         size = self.descriptor.points * RADIAL * ANGULAR + FIXED
         example = np.random.default_rng(0).integers(0, 64, size) / 64.0
         return write_model(path, self, read, self.notes, example)

@@ -1,17 +1,17 @@
-"""The position of a predicted posture, from the position and the size of the silhouette.
+"""Root position of a predicted posture, from the position and the size of the silhouette.
 
 The shape of a silhouette does not show the depth; its size relative to that of the posture does.
-The root is moved until the flesh of the posture, projected exactly, has the bounding box of the
+The root is moved until the exact projection of the posture's flesh has the bounding box of the
 silhouette. With the residual r(t), the sides of the box of the flesh at root t minus those of the
 silhouette, and J = dr/dt, the Gauss-Newton step is
 
     t <- t - (J' S^-1 J + P^-1)^-1 (J' S^-1 r + P^-1 (t - t_0)),   S = J_x C J_x' + noise
 
-C is the covariance of the predicted posture, and J_x the derivative with respect to it: an arm that
-may also hang down carries little information about the width. P is a wide prior. A side where the
-border of the image cuts the person only shows that the person reaches this border. The root then
-depends on the other sides and on P, and its covariance is larger. A person may be larger or smaller
-than the body, which scales all distances from the camera alike.
+C is the covariance of the predicted posture, and J_x the derivative with respect to the posture, so
+an arm of uncertain posture carries little information about the width. P is a wide prior. If the
+border of the image cuts the person, that side only shows that the person reaches the border. The
+root then depends on the other sides and on P, and its covariance is larger. A person may be larger
+or smaller than the body, which scales all distances from the camera by the same factor.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from hmt_ros.experts.pose_encoding import PoseEncoding, cross
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import inverse, product, solve
 
-STACKS, SLICES = 9, 12  # size of the mesh; its box is exact to 1 % of the radius of a part
+STACKS, SLICES = 9, 12  # of the mesh; its bounding box is exact to 1 % of the radius of a part
 SIZE_SPREAD = 0.06  # relative standard deviation of the size of persons
 CUT_SPREAD = 0.15  # additional deviation for a person who is cut by the border
-# Standard deviation of a side of the box: of the outline, px, and of hair, clothes and shoes, as a
-# share of the longer side of the box.
+# Standard deviations of a side of the box: from the outline, px; and from hair, clothes and shoes,
+# relative to the longer side of the box.
 OUTLINE_SIGMA, CLOTHES = 1.5, 0.02
-# Prior standard deviations along and across the line of sight, as shares of the distance.
+# Prior standard deviations along and across the line of sight, relative to the distance.
 DEPTH_SPREAD, ACROSS_SPREAD = 0.7, 1.0
 STEPS = 10
-# Step lengths over the depth: below which the iterations end, above which the derivatives of the
-# encoding are recomputed, and the maximum.
+# Step lengths relative to the depth: iterations end below the first; derivatives of the encoding
+# are recomputed above the second; the third is the maximum.
 DONE, TURNED, LONGEST_STEP = 1e-3, 0.05, 0.4
 
 
@@ -77,8 +77,8 @@ def place_roots(
     Args:
         targets: (M, D) predicted targets.
         covariances: (M, D, D) covariances of the prediction.
-        size_spread: Relative standard deviation of the person's size; 0 if the body has the lengths
-            of the person.
+        size_spread: Relative standard deviation of the person's size; 0 if the body has the
+            person's lengths.
 
     Raises:
         ValueError: the body has no flesh.
@@ -134,10 +134,10 @@ def placed_gaussians(
 ) -> tuple[Array, Array]:
     """Convert Gaussians over targets and roots to Gaussians over poses, (M, d) and (M, d, d).
 
-    The root moves with the posture so that the box stays that of the silhouette.
+    The root depends on the posture such that the projected box still equals the silhouette's.
 
     Args:
-        targets, covariances: (M, D), (M, D, D) of the postures.
+        targets, covariances: (M, D), (M, D, D) Gaussians over the targets of the postures.
     """
     by_target, by_root = placement.jacobians
     whole = by_target + product(by_root, placement.by_targets)
@@ -153,7 +153,7 @@ def _mesh(body: Body) -> Mesh:
 
 
 def _first_roots(encoding: PoseEncoding, camera: Camera, sides: Array, targets: Array) -> Array:
-    """Roots (M, 3) on the ray of the middle of the box, at the depth that its diagonal gives."""
+    """Initial roots (M, 3): on the ray through the box centre, at a depth from the diagonal."""
     left, top, right, bottom = sides
     middle = np.array([0.5 * (left + right), 0.5 * (top + bottom)])
     ray, first, second = camera.rays(np.array([middle, [left, top], [right, bottom]]))
@@ -206,7 +206,7 @@ def _box_error(
     chosen = points[rows, outermost]  # (M, 4, 3)
     pixels, by_point = camera.project_with_derivative(chosen.transpose(2, 0, 1))
     coordinate = np.array([0, 1, 0, 1])
-    # pixels (2, M, 4) and by_point (2, 3, M, 4), of the coordinate that the side bounds
+    # From pixels (2, M, 4) and by_point (2, 3, M, 4), select the coordinate that each side bounds.
     value = np.stack([pixels[c, :, k] for k, c in enumerate(coordinate)], axis=1)
     slope = np.stack([by_point[c, :, :, k].T for k, c in enumerate(coordinate)], axis=1)
     by_pose = np.einsum(
@@ -222,7 +222,7 @@ def _box_error(
 
 
 def _by_pose(frames: Frames, mesh: Mesh, vertices: Index, points: Array) -> Array:
-    """Derivatives (M, 4, d, 3) with respect to poses, of points (M, 4, 3) at some vertices."""
+    """Derivatives (M, 4, d, 3) of points (M, 4, 3), at given vertices, with respect to poses."""
     skeleton = frames.skeleton
     axes, origins = frames.dofs_by_pose()  # (M, d, 3)
     arm = points[:, :, None] - origins[:, None]

@@ -12,8 +12,8 @@ M = L^-1 Phi' H X, and the evidence, the integral over W of the weighted likelih
 where T = sum h. For given precisions the best O is (X'HX - M'LM + prior) / (T + nu). For given O
 the best precision of one function has the closed form of Tipping and Faul (AISTATS 2003), here with
 all D outputs together. Functions are added, removed and re-estimated one at a time, always the one
-that gains most. Only the sums Phi'H Phi, Phi'HX and X'HX enter, so a step costs O(K m + K D) for K
-candidates of which m are active, whatever the number of samples.
+that gains most. Only the sums Phi'H Phi, Phi'HX and X'HX are needed, so a step costs O(K m + K D)
+for K candidates and m active functions, independent of the number of samples.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from hmt_ros.inference.arrays import Array, Index
 INDEPENDENT = 1e-8
 # Relative squared difference below which two functions count as equal.
 ALIGNED = 1e-8
-# Largest standard deviation of a weight, in standard deviations of the outputs. Without it, kernels
-# of which the expert's samples reach only the tails would get unbounded weights.
+# Maximum prior standard deviation of a weight, in standard deviations of the outputs. It bounds the
+# weights of kernels that are nearly zero at all samples of the expert.
 LARGEST_WEIGHT = 10.0
-ROUNDS = 100  # maximum number of rounds of greedy steps and a new noise estimate
+ROUNDS = 100  # maximum number of rounds; each takes greedy steps and re-estimates the noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class WeightedSums:
     @classmethod
     def of(cls, features: Array, targets: Array, weights: Array) -> WeightedSums:
         """Sums over features (N, K), targets (N, D), weights (N,)."""
-        # Samples of other experts have no weight.
+        # Skip samples without weight, which belong to other experts.
         some = weights > 1e-10 * weights.max()
         if not some.all():
             features, targets, weights = features[some], targets[some], weights[some]
@@ -96,7 +96,7 @@ class SparseRegression:
     evidence: float
 
     def mean(self, features: Array) -> Array:
-        """M' phi, (n, D), of features (n, K) of all candidates."""
+        """Means M' phi, (n, D), from the features (n, K) of all candidates."""
         return features[:, self.active] @ self.weights
 
     def spread(self, features: Array) -> Array:
@@ -108,9 +108,9 @@ class SparseRegression:
 def posterior(
     sums: WeightedSums, active: Index, precisions: Array, noise: Array, prior: RegressionPrior
 ) -> SparseRegression:
-    """The posterior for given functions, precisions and noise, by a fresh Cholesky factor."""
+    """The posterior for given functions, precisions and noise, by a Cholesky decomposition."""
     inner = sums.gram[np.ix_(active, active)] + np.diag(precisions)
-    # Scaled to a unit diagonal: precisions span many orders of magnitude.
+    # Scale to a unit diagonal, because precisions span many orders of magnitude.
     root = 1.0 / np.sqrt(np.diagonal(inner))
     factor = np.linalg.cholesky(inner * root[:, None] * root)
     whitener = np.linalg.inv(factor) * root
@@ -135,7 +135,7 @@ def posterior(
 def with_best_noise(
     sums: WeightedSums, found: SparseRegression, prior: RegressionPrior
 ) -> SparseRegression:
-    """The regression with the same functions and precisions, and the best noise."""
+    """Re-estimate the noise of a regression and keep its functions and precisions."""
     cross = sums.cross[found.active]
     residual = sums.outer - cross.T @ found.weights
     noise = (residual + prior.scale) / (sums.total + prior.strength)
@@ -152,10 +152,10 @@ def maximise_evidence(
     rounds: int = ROUNDS,
     tolerance: float = 1e-3,
 ) -> SparseRegression:
-    """Maximises the evidence from a start, or from no functions.
+    """Maximise the evidence, starting from an earlier result or from no functions.
 
     Args:
-        start: Earlier result, perhaps for other weights of the samples.
+        start: Earlier result; its samples may have had other weights.
         steps: Number of greedy steps between two estimates of the noise.
         rounds: Maximum number of estimates of the noise.
         tolerance: Gain of a round below which the rounds end, nats.
@@ -183,7 +183,7 @@ def _greedy(
     steps: int,
     tolerance: float,
 ) -> tuple[SparseRegression, bool]:
-    """Adds, removes and re-estimates functions for a fixed noise, each time the best one."""
+    """Add, remove and re-estimate functions for a fixed noise, each time the best one."""
     state = _GreedyState(sums, found)
     moved = False
     for _ in range(steps):
@@ -193,7 +193,7 @@ def _greedy(
     if not moved:
         return found, False
     better = posterior(sums, state.active, state.precisions, found.noise, prior)
-    # Rank-one updates drift, and the gain may not be real.
+    # Rank-one updates accumulate rounding errors, so check that the evidence has increased.
     if not better.evidence > found.evidence:
         return found, False
     return better, True
@@ -244,7 +244,7 @@ class _GreedyState:
     def _best(self) -> tuple[int, float, float]:
         """The function with the largest gain of evidence, the gain, and its new precision.
 
-        At precision a a function adds 1/2 (d log(a / (a + s)) + q / (a + s)).
+        A function of precision a adds 1/2 (d log(a / (a + s)) + q / (a + s)) to the evidence.
         """
         d = self.outputs
         s, q = self.S.copy(), np.einsum('kd,kd->k', self.Q, self.Q)
@@ -312,7 +312,7 @@ class _GreedyState:
         self._exclude()
 
     def _take(self, place: int, column: Array, kappa: float) -> None:
-        """Subtracts kappa column column' from the covariance."""
+        """Subtract kappa column column' from the covariance; update S and Q."""
         left = self.gram[:, self.active] @ column
         # Q of an active function is its precision times its weight.
         weight = self.Q[self.active[place]] / self.precisions[place]

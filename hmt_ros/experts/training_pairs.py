@@ -1,4 +1,4 @@
-"""Pairs of inputs and targets, checked once on entry, and their scales."""
+"""Checked training pairs of inputs and targets, and their standardisation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class TrainingPairs:
     Attributes:
         inputs: (N, p).
         targets: (N, D).
-        weights: (N,) positive; a sample of weight 2 counts like two equal samples.
+        weights: (N,) positive; a sample of weight 2 counts as two equal samples.
     """
 
     inputs: Array
@@ -42,7 +42,7 @@ class Standardisation:
         centre, scale: (p,) each.
 
     Raises:
-        ValueError: shapes that differ, or a scale that is not positive.
+        ValueError: the shapes differ, or a scale is not positive.
     """
 
     centre: Array
@@ -59,8 +59,8 @@ class Standardisation:
         Args:
             values: (N, p).
             weights: (N,).
-            scaling: 'each' scales every column by itself; 'common' has one scale for all columns,
-                which keeps the metric. A column that does not vary keeps its scale.
+            scaling: 'each' scales every column separately; 'common' uses one scale for all columns,
+                which keeps ratios of distances. A constant column keeps its scale.
 
         Raises:
             ValueError: the scaling is unknown.
@@ -71,7 +71,7 @@ class Standardisation:
         variance = share @ (values - centre) ** 2
         if scaling == 'common':
             variance = np.full_like(variance, variance.mean())
-        # Rounding gives a constant column a tiny variance.
+        # Rounding errors give a constant column a tiny variance.
         constant = variance <= (1e-12 * np.maximum(1.0, np.abs(centre))) ** 2
         return cls(centre, np.where(constant, 1.0, np.sqrt(variance)))
 
@@ -91,8 +91,8 @@ def checked_pairs(
     """The pairs as arrays, without samples of weight zero.
 
     Args:
-        sample_weight: (N,) not negative, or None for ones.
-        what: Reason for that minimum, for the message.
+        sample_weight: (N,) nonnegative weights; None: all weights are 1.
+        what: Reason for the minimum `at_least`, for the error message.
 
     Raises:
         ValueError: shapes are wrong, values are not finite, or there are too few samples.

@@ -1,4 +1,4 @@
-"""The links of the chains whose interpretation trees the core grows (KJS 3)."""
+"""Links of chains, as input for the compiled interpretation trees (KJS 3)."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from hmt_ros.inference.arrays import Array
 
 
 class ChainLinks(NamedTuple):
-    """The links of a chain, K with D degrees of freedom, as the core reads them.
+    """K links of a chain with D degrees of freedom, as input for the compiled functions.
 
-    A link is spherical (x y z), a hinge (x) or an end effector (x y): 3, 1 or 2 degrees of freedom.
+    A link is spherical (axes x y z), a hinge (x) or an end effector (x y).
 
     Attributes:
-        segments: (K,) segment of each link.
-        parent: segment that the chain hangs on.
-        mounts: (K, 3, 3) mounts of the segments.
+        segments: (K,) index of the segment of each link.
+        parent: index of the segment to which the chain is attached.
+        mounts: (K, 3, 3) mounting rotations of the segments.
         mounted: (K,) whether the mount is not the identity.
-        lengths: (K,) from joint to joint, m.
-        first_dofs: (K + 1,) position in `dofs` of the first one of each link.
-        dofs: (D,) degrees of freedom of all links.
-        lower, upper: (D,) limits, rad.
-        sides: (K, 2) which of the two solutions for its angles the limits of a link admit.
+        lengths: (K,) lengths from joint to joint, m.
+        first_dofs: (K + 1,) position in `dofs` of each link's first degree of freedom.
+        dofs: (D,) indices of the degrees of freedom of all links.
+        lower, upper: (D,) limits of the angles, rad.
+        sides: (K, 2) whether the limits of a link admit each of the two solutions for its angles.
     """
 
     segments: NDArray[np.int64]
@@ -44,11 +44,11 @@ class ChainLinks(NamedTuple):
 
 @lru_cache(maxsize=64)
 def chain_links(skeleton: Skeleton, name: str) -> ChainLinks:
-    """The links of a chain.
+    """Collects the links of a chain.
 
     Raises:
-        KeyError: a chain that the skeleton does not have.
-        ValueError: a chain whose joints have no closed form, or limits that no angle satisfies.
+        KeyError: the skeleton has no such chain.
+        ValueError: the joints have no closed form, or no angle satisfies the limits.
     """
     if name not in skeleton.chains:
         raise KeyError(f'{skeleton.name} has no chain {name!r}; it has {sorted(skeleton.chains)}')
@@ -78,7 +78,7 @@ def chain_links(skeleton: Skeleton, name: str) -> ChainLinks:
             )
         after_spherical = axes == 'xyz'
         lengths.append(float(-end[2]))
-        # The two solutions differ in the sign of sin e, or in that of cos b.
+        # The two solutions differ in the sign of the hinge's sine, or of the second angle's cosine.
         bend = dofs[0] if hinge else dofs[1]
         sides.append(_signs(skeleton.lower[bend], skeleton.upper[bend], hinge))
         if not any(sides[-1]):
@@ -104,7 +104,7 @@ def chain_links(skeleton: Skeleton, name: str) -> ChainLinks:
 
 @lru_cache(maxsize=64)
 def _signs(lower: float, upper: float, sine: bool) -> list[bool]:
-    """Whether angles within the limits give the sine, or the cosine, a sign: first +, then -."""
+    """Whether angles within the limits have a positive, and a negative, sine or cosine."""
     samples = np.linspace(lower, min(upper, lower + 2.0 * np.pi), 721)
     values = elementary.sin(samples) if sine else elementary.cos(samples)
     return [bool(np.any(values > 1e-6)), bool(np.any(values < -1e-6))]

@@ -1,17 +1,17 @@
-"""Forwards/backwards flips of limbs: interpretation trees, closed-form inverse kinematics (KJS 3).
+"""Forward/backward flips of limbs: interpretation trees, closed-form inverse kinematics (KJS 3).
 
-For a link from a known joint P, of length l, to a joint seen along the unit ray r, the joint is at
+A link of length l leads from a known joint P to a joint on the unit ray r. This joint is at
 
     s r,    s = r.P +- sqrt((r.P)^2 - |P|^2 + l^2).
 
-All choices of sign along a chain are the leaves of its interpretation tree; a branching body takes
-the product of the trees of its chains. Every leaf has the image and the segment lengths of the
-given pose, which is itself the first leaf. Branches whose ray misses the sphere, that put a joint
-behind the camera, or that no joint angles within the limits reach, are pruned.
+The choices of sign along a chain are the leaves of its interpretation tree; for a branching body,
+the trees of its chains are multiplied. Every leaf has the image and the segment lengths of the
+given pose, which is the first leaf. A branch is pruned if its ray misses the sphere, if a joint is
+behind the camera, or if no joint angles within the limits reach it.
 
-`distinct_poses` compares poses by their joint positions, not by their angles: a rotation has two
-triples of Euler angles, Rx(a) Ry(b) Rz(c) = Rx(a + pi) Ry(pi - b) Rz(c + pi), every angle has its
-turns of 2 pi, and the twist of a straight limb moves nothing that is seen.
+`distinct_poses` compares joint positions, because poses do not have unique angles: a rotation has
+two triples of Euler angles, Rx(a) Ry(b) Rz(c) = Rx(a + pi) Ry(pi - b) Rz(c + pi), angles are
+periodic, and the twist of a straight limb is invisible.
 """
 
 from __future__ import annotations
@@ -32,21 +32,36 @@ from hmt_ros.inference.arrays import Array, Index
 def enumerate_flips(
     body: Body, poses: ArrayLike, chains: Sequence[str] | str
 ) -> tuple[Array, Index]:
-    """All poses with the image of the given ones that flips of some chains reach.
+    """Enumerates the flips of chains: poses with the same image as the given poses.
 
     Args:
-        body: the body.
-        poses: (N, d) in the frame of the camera. Flips move joints along their rays, so that the
-            lens of the camera does not matter.
-        chains: name of a chain, or several names: then the product of their trees is taken.
+        body: body of the poses.
+        poses: (N, d) poses in the camera frame. Flips move joints along their rays, so the lens of
+            the camera does not matter.
+        chains: name of a chain, or several names, whose trees are multiplied.
 
     Returns:
-        poses (M, d), grouped by the given pose, which is the first of its own leaves, and the
-        index (M,) of that pose.
+        Poses (M, d), grouped by given pose, and the index (M,) of the given pose. A given pose is
+        the first of its group.
 
     Raises:
-        KeyError: the body does not have a chain.
+        KeyError: the body has no such chain.
         ValueError: the joints of a chain have no closed form, or two chains share segments.
+
+    Example:
+        Four poses of an arm have one image: the upper arm and the forearm each lead towards the
+        camera or away from it.
+
+        >>> import numpy as np
+        >>> from hmt_ros.body import Camera, load_body
+        >>> body = load_body('human37')
+        >>> pose = np.r_[0.0, 0.0, 4.0, body.prior_mean[3:]]
+        >>> flips, parents = enumerate_flips(body, pose, 'left_arm')
+        >>> wrist = body.joint_names.index('left_wrist')
+        >>> camera = Camera(fx=600.0, fy=600.0, cx=319.5, cy=239.5, width=640, height=480)
+        >>> pixels = camera.project(body.joint_positions(flips)[:, wrist])
+        >>> len(flips), bool(np.ptp(pixels, axis=0).max() < 1e-6)
+        (4, True)
     """
     names = [chains] if isinstance(chains, str) else list(chains)
     skeleton = body.skeleton
@@ -68,7 +83,7 @@ def enumerate_flips(
 
 
 def _leaves(frames: Frames, poses: Array, chain: ChainLinks) -> tuple[Array, NDArray[np.bool_]]:
-    """Angles (N, leaves, chain dofs) and validity (N, leaves); leaf 0 is the given pose."""
+    """Angles (N, leaves, chain dofs) and validity (N, leaves) of leaves; 0 is the given pose."""
     lengths = chain.lengths[:, None, None]
     ends = frames.origins[chain.segments] - lengths * frames.columns[chain.segments, 2]
     count = 2 ** len(chain.lengths)
@@ -82,12 +97,12 @@ def _leaves(frames: Frames, poses: Array, chain: ChainLinks) -> tuple[Array, NDA
 
 
 class Distinct(NamedTuple):
-    """Poses that represent all of a set.
+    """Poses that represent a set of poses.
 
     Attributes:
-        kept: (K,) indices, in the order of the poses.
-        owner: (N,) position in `kept` of the representative of each pose; -1 where the maximum
-            number was reached before.
+        kept: (K,) indices of the kept poses, ascending.
+        owner: (N,) position in `kept` of the representative of each pose; -1 if the maximum number
+            was reached before.
     """
 
     kept: Index
@@ -95,19 +110,19 @@ class Distinct(NamedTuple):
 
 
 def distinct_poses(joints: ArrayLike, apart: float, most: int | None = None) -> Distinct:
-    """Poses that differ from every earlier one.
+    """Selects poses that differ from all earlier poses.
 
-    The distance of two poses is that of the joint that is furthest apart. A pose that is nearer
-    than `apart` to one that is kept is represented by the nearest of these. So the first, best
-    poses represent later ones.
+    The distance of two poses is the largest distance of a joint. If kept poses are nearer than
+    `apart` to a pose, the nearest of them represents it. So early, better poses represent later
+    ones.
 
     Args:
         joints: (N, J, 3) joint positions of the poses, m.
-        apart: distance from which on two poses are distinct, m.
-        most: maximum number of poses that are kept; None keeps all that are distinct.
+        apart: minimum distance of two distinct poses, m.
+        most: maximum number of kept poses; None: no maximum.
 
     Raises:
-        ValueError: joints of another shape.
+        ValueError: the joints have another shape.
     """
     points = np.ascontiguousarray(joints, dtype=np.float64)
     if points.ndim != 3 or points.shape[2] != 3:

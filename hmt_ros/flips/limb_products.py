@@ -1,13 +1,14 @@
 """Configurations of all limbs on the trunks of a group of modes, and their products (KJS 3).
 
-Modes with nearly the same trunk form a group. On its trunk each limb has configurations: those of
-the modes, their flips, and the results of a search. Other trunks have the same image: two limbs
-that each take the other's place, and the torso flipped in depth. On each of them the limbs hang in
-all ways that keep their image.
+Modes with nearly the same trunk form a group. On the group's trunk each limb has several
+configurations: those of the modes, their flips, and the results of a search. Further trunks have
+the same image: with two limbs exchanged, or with the torso flipped in depth. On each of these
+trunks a limb has all configurations that keep its image.
 
-Because limbs are nearly independent given the trunk, the energy of a product is that of its trunk
-plus the change that each configuration makes alone: a few dozen evaluations rate thousands of
-poses. Everything is compiled, a call a group; the energies are evaluated between two calls.
+A product combines one configuration of each limb. Because limbs are nearly independent given the
+trunk, the energy of a product is that of its trunk plus the change due to each configuration alone:
+a few dozen evaluations rate thousands of poses. Compiled functions process a group per call; the
+energies are evaluated between two calls.
 """
 
 from __future__ import annotations
@@ -31,14 +32,15 @@ from hmt_ros.inference.arrays import Array, Index
 
 
 class Limbs(NamedTuple):
-    """The C limbs of a body as the core reads them, of at most K links and D variables.
+    """The C limbs of a body, with at most K links and D variables, for the compiled functions.
 
     Attributes:
-        links, dofs, joints: (C,) number of links, of degrees of freedom and of joints that move.
-        segments, parents, mounts, mounted, lengths, first_dofs, own, lower, upper, sides: those of
-            `ChainLinks`, filled up to the largest limb.
-        joint_segments, joint_offsets: (C, J), (C, J, 3) of the joints that a limb moves.
-        siblings: (C,) the limb of the other side; -1 for a limb without one.
+        links, dofs, joints: (C,) numbers of links, of degrees of freedom and of moved joints.
+        segments, parents, mounts, mounted, lengths, first_dofs, own, lower, upper, sides: the
+            attributes of `ChainLinks`, zero-padded to the largest limb.
+        joint_segments, joint_offsets: segments (C, J) and offsets (C, J, 3) of the joints that a
+            limb moves.
+        siblings: (C,) index of the same limb on the other side; -1 if missing.
     """
 
     links: NDArray[np.int64]
@@ -61,7 +63,7 @@ class Limbs(NamedTuple):
 
 @lru_cache(maxsize=16)
 def limbs_of(skeleton: Skeleton) -> Limbs:
-    """The limbs of a skeleton, in the order of its chains.
+    """Collects the limbs of a skeleton, in the order of its chains.
 
     Raises:
         ValueError: a chain has no closed form; see `chain_links`.
@@ -100,7 +102,7 @@ def limbs_of(skeleton: Skeleton) -> Limbs:
 
 
 def _filled(arrays: list[NDArray[Any]]) -> NDArray[Any]:
-    """Arrays of different lengths in one, filled up with zeros."""
+    """Stacks arrays of different lengths, padded with zeros."""
     most = max(len(x) for x in arrays)
     result = np.zeros((len(arrays), most, *arrays[0].shape[1:]), dtype=arrays[0].dtype)
     for row, x in zip(result, arrays, strict=True):
@@ -109,13 +111,14 @@ def _filled(arrays: list[NDArray[Any]]) -> NDArray[Any]:
 
 
 class Configurations(NamedTuple):
-    """Configurations of limbs on T trunks; the first trunk is that of G modes.
+    """Configurations of limbs on T trunks; the first is the trunk of a group of G modes.
 
     Attributes:
-        trunks: (T, d) a pose of each trunk.
+        trunks: (T, d) one pose with each trunk.
         angles: (T, C, A, D) angles of each configuration of each limb.
-        counts: (T, C) number of configurations; 0: those on the first trunk.
-        penalties: (G, C, A) minus the log probability that a mode takes each on the first trunk.
+        counts: (T, C) numbers of configurations; 0: the same configurations as on the first trunk.
+        penalties: (G, C, A) minus the log probability that a mode changes to each configuration on
+            the first trunk.
     """
 
     trunks: Array
@@ -126,12 +129,12 @@ class Configurations(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Products:
-    """Whole poses.
+    """Whole poses that combine configurations of all limbs.
 
     Attributes:
-        poses: (N, d).
-        parents: (N,) position in the group of the mode that each comes from.
-        energies: (N,) estimated.
+        poses: (N, d) poses.
+        parents: (N,) position in the group of the source mode of each pose.
+        energies: (N,) estimated energies.
     """
 
     poses: Array
@@ -141,14 +144,14 @@ class Products:
 
 @dataclass(frozen=True, eq=False)
 class LimbProducts:
-    """The products of a group of modes, and those on other trunks with the same image.
+    """Products of limb configurations for a group of modes, also on trunks with the same image.
 
     Attributes:
-        body: the body.
-        modes: (G, d) of the group, the best first.
-        configurations: of the limbs; first the trunk of the group, then those on which two limbs
-            have changed places, then those whose torso is flipped.
-        exchanged: number of trunks with limbs that have changed places.
+        body: body of the modes.
+        modes: (G, d) poses of the group, best first.
+        configurations: configurations of the limbs, on the trunk of the group, then on trunks with
+            two limbs exchanged, then on trunks with the torso flipped.
+        exchanged: number of trunks with exchanged limbs.
     """
 
     body: Body
@@ -168,16 +171,17 @@ class LimbProducts:
         most: int,
         poses: int = sys.maxsize,
     ) -> LimbProducts:
-        """Configurations of all limbs in a group.
+        """Finds the configurations of all limbs for a group.
 
         Args:
-            body: whose chains have closed forms; at least one.
-            modes: (G, d) of the group, the best first.
-            found: further angles (F, chain dofs) of some chains.
-            price: of a configuration that is not a mode's own, nats.
-            apart: configurations are distinct when some joint is as far apart, m.
-            most: configurations of a limb on a trunk.
-            poses: to evaluate at most; the last trunks are left out. That of the group stays.
+            body: body with at least one chain; its chains must have closed forms.
+            modes: (G, d) poses of the group, best first.
+            found: further configurations (F, chain dofs) by name of the chain.
+            price: penalty of a configuration other than the mode's own, nats.
+            apart: minimum distance in some joint between distinct configurations, m.
+            most: maximum number of configurations of a limb on a trunk.
+            poses: maximum number of poses to evaluate, for which the last trunks are left out, but
+                never the group's own trunk.
         """
         limbs, skeleton = limbs_of(body.skeleton), body.skeleton
         modes = np.ascontiguousarray(modes, dtype=np.float64)
@@ -214,9 +218,9 @@ class LimbProducts:
 
     @property
     def alone(self) -> tuple[Array, Index]:
-        """Poses (P, d) to evaluate: each trunk with its pose, then with each other configuration.
+        """Poses (P, d) to evaluate, and rows (R,) of the pose of each trunk and configuration.
 
-        Rows (R,) are the poses of each trunk, then of each of its configurations.
+        For each trunk, the rows are its pose, then this pose with each configuration of one limb.
         """
         found = self.configurations
         count = len(found.trunks) + int(found.counts.sum())
@@ -234,15 +238,15 @@ class LimbProducts:
         share: float,
         count: int,
     ) -> Products:
-        """The most probable products on each trunk, best first, trunk after trunk.
+        """Selects the most probable products on each trunk, best first, trunk by trunk.
 
-        The cost of a product is the sum over limbs of the share of the changes in energy and of the
+        The cost of a product is `share` times the energy changes of its limbs, plus their
         penalties, minus the log weight of the mode.
 
         Args:
-            energies: (R,) of the rows of the poses `alone`.
-            exchange, flip: prices of limbs that change places, and of a flipped torso, nats.
-            share: of the energy that counts.
+            energies: (R,) energies at the rows of `alone`.
+            exchange, flip: penalties of exchanged limbs and of a flipped torso, nats.
+            share: factor on the energy.
         """
         found = self.configurations
         most = len(found.trunks) * count

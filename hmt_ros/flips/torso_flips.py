@@ -1,9 +1,9 @@
-"""Flips of the torso: the pelvis and the trunk leaning or turning the other way in depth (KJS 3).
+"""Flips of the torso: pelvis and trunk lean or turn the other way in depth (KJS 3).
 
-The line of the hips may turn towards or away from the camera, the neck may lie before or behind the
-start of the trunk, and the line of the shoulders may turn either way: three binary choices, with
-nearly the same image. The torso is not a chain of links that each end in one joint, so its flips
-change the image of hips, neck and shoulders a little; the limbs are then put back onto their rays.
+The line of the hips can turn towards or away from the camera, the neck can be in front of or behind
+the start of the trunk, and the line of the shoulders can turn either way: three binary choices with
+nearly the same image. The torso is not a chain of links with one joint at each end, so its flips
+change the image of hips, neck and shoulders a little; the limbs are then moved back to their rays.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ JOINTS = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_sho
 
 
 def flip_torso(body: Body, poses: ArrayLike) -> tuple[Array, Index]:
-    """Poses whose torso is flipped in depth, up to seven for each given one.
+    """Flips the torso in depth: up to seven poses for each given pose.
 
     Args:
-        body: body with the joints of a torso, a root that turns about z, y and x, and a segment
-            'trunk' that turns about x, y and, if it can twist, z. Others have no such flips.
-        poses: (N, d).
+        body: body with the joints of a torso, a root that rotates about z, y and x, and a segment
+            'trunk' that rotates about x, y and, if it can twist, z. Other bodies have no flips.
+        poses: (N, d) poses.
 
     Returns:
-        poses (M, d) within the limits, with the given angles of the limbs, and the index (M,) of
-        the pose that each comes from.
+        Poses (M, d) within the limits, with unchanged angles of the limbs, and the index (M,) of
+        the given pose of each.
     """
     skeleton = body.skeleton
     q = np.array(poses, dtype=np.float64, ndmin=2, order='C')
@@ -49,14 +49,14 @@ def flip_torso(body: Body, poses: ArrayLike) -> tuple[Array, Index]:
 
 
 class _Torso(NamedTuple):
-    """The torso as the core reads it.
+    """Torso, as input for the compiled functions.
 
     Attributes:
-        root, trunk: (3,), (0, 2 or 3) degrees of freedom that turn the root and the trunk.
-        segment: the trunk.
-        joint_segments, joint_offsets: (6,), (6, 3) of the `JOINTS`.
-        lower, upper: (d,) limits.
-        flips: (F, 3) whether the hips turn, the torso leans and the shoulders turn.
+        root, trunk: degrees of freedom that rotate the root (3,) and the trunk (0, 2 or 3).
+        segment: index of the trunk's segment.
+        joint_segments, joint_offsets: segments (6,) and offsets (6, 3) of the `JOINTS`.
+        lower, upper: (d,) limits of the pose.
+        flips: (F, 3) whether each flip turns the hips, leans the torso and turns the shoulders.
     """
 
     root: NDArray[np.int64]
@@ -71,7 +71,7 @@ class _Torso(NamedTuple):
 
 @lru_cache(maxsize=16)
 def _torso_of(skeleton: Skeleton) -> _Torso | None:
-    """The torso of a skeleton; None: it has none that can flip."""
+    """Torso of a skeleton; None if it has no torso that can flip."""
     (root, axes), trunk = rotations_of(skeleton, 0), _trunk_dofs(skeleton)
     if axes != ROOT_AXES or trunk is None or not set(JOINTS) <= set(skeleton.joint_names):
         return None
@@ -89,19 +89,19 @@ def _torso_of(skeleton: Skeleton) -> _Torso | None:
 
 
 def _flips(trunk_dofs: int) -> list[tuple[bool, bool, bool]]:
-    """Whether the hips turn, the torso leans and the shoulders turn, in all ways there are."""
+    """All possible flips: whether the hips turn, the torso leans and the shoulders turn."""
     return [
         (turn_hips, lean, turn_shoulders)
         for turn_hips, lean, turn_shoulders in itertools.product((False, True), repeat=3)
         if (turn_hips or lean or turn_shoulders)
-        # Without a twist the shoulders turn with the hips.
+        # If the trunk cannot twist, the shoulders turn with the hips.
         and (trunk_dofs >= 3 or turn_shoulders == turn_hips)
         and (trunk_dofs >= 2 or not lean)
     ]
 
 
 def _trunk_dofs(skeleton: Skeleton) -> list[int] | None:
-    """The rotations of the trunk, if they are about x, y and z, or x and y, or none."""
+    """Rotations of the trunk if their axes are xyz, xy or none; otherwise None."""
     if 'trunk' not in skeleton.segment_names:
         return None
     own, axes = rotations_of(skeleton, skeleton.segment_names.index('trunk'))

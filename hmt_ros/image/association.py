@@ -1,15 +1,16 @@
-"""Assignment of the people whom a detector sees in an image to the people who are tracked.
+"""Assignment of people detected in an image to the tracked people.
 
     cost(i, j) = median_k |u_ik + v_i dt - p_jk| / s_i        over the joints k that both have
 
-u_i are the joints of person i where they were last seen, v_i is the velocity of the person in the
-image, s_i the size of the person, and p_j are the joints of detection j; where they have no joints
-in common, the middles of their boxes count. A pair is possible below a cost that grows with the
-time for which the person was not seen. The assignment minimises the sum of costs; a person without
-a detection has the cost of the worst possible pair.
+u_i are the last seen joints of person i, v_i is the velocity of the person in the image, s_i the
+size of the person, and p_j are the joints of detection j. If the two have no common joints, the
+centres of their boxes are used. A pair is possible below a cost that grows with the time since the
+person was last seen. The assignment minimises the sum of costs; a person without a detection has
+the cost of the worst possible pair.
 
-The nearer of two people hides the farther one. For the farther one all pixels of the nearer one are
-unknown; for the nearer one only those of the farther one outside its own area.
+The nearer of two people hides the farther one. For the farther person, all pixels of the nearer one
+are unknown; for the nearer person, pixels of the farther one are unknown only outside the nearer
+person's own area.
 """
 
 from __future__ import annotations
@@ -26,25 +27,25 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.inference.error_model import seconds
 
-# Cost below which a pair is possible from one image to the next, in sizes of the person; it doubles
-# within `EXPECTED_TIME`.
+# Cost below which a pair is possible from one image to the next, in sizes of the person; this limit
+# doubles within `EXPECTED_TIME`.
 GATE = 0.4
-# Time for which a person is assumed to keep the velocity, and the size although less is visible, s.
+# Time for which a person is assumed to keep velocity and, even if less is visible, size, s.
 EXPECTED_TIME = 1.0
 # Time constant of the velocity of a person in the images, s.
 VELOCITY_TIME = 0.25
-# Margin around the area of a person, or around the hull of keypoints, that is masked for other
-# people, as a fraction of the height: the radius of a limb.
+# Margin of the masked area of a person, or of the hull of keypoints, for the radius of a limb, as a
+# fraction of the height.
 LIMB_MARGIN = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """Where somebody is in an image.
+    """Position of a person in an image.
 
     Attributes:
         joints: pixels (2,) of the visible joints, by name.
-        corners: (2, 2) left top and right bottom of the box around the person, px.
+        corners: (2, 2) top left and bottom right corner of the box around the person, px.
     """
 
     joints: dict[str, Array]
@@ -52,13 +53,13 @@ class Sighting:
 
     @classmethod
     def of(cls, keypoints: Keypoints, corners: Array) -> Sighting:
-        """A sighting from a box and keypoints, which may be empty."""
+        """A sighting from a box and from keypoints; there may be no keypoints."""
         seen = np.flatnonzero(keypoints.seen)
         return cls({keypoints.names[i]: keypoints.pixels[i] for i in seen}, corners)
 
     @property
     def middle(self) -> Array:
-        """Middle (2,) of the box, px."""
+        """Centre (2,) of the box, px."""
         return np.asarray(self.corners.mean(0))
 
     @property
@@ -67,7 +68,7 @@ class Sighting:
         return max(float(elementary.hypot(*(self.corners[1] - self.corners[0]))), 1.0)
 
     def shifts_to(self, other: Sighting) -> Array:
-        """Shifts (n, 2) of the common joints, or else of the middle, to another sighting."""
+        """Shifts (n, 2) of the common joints, or else of the box centre, to another sighting."""
         common = [name for name in self.joints if name in other.joints]
         if not common:
             return np.asarray((other.middle - self.middle)[None])
@@ -75,17 +76,17 @@ class Sighting:
 
 
 class ImageTrack:
-    """Where a person was last seen in the images, and how fast the person moves there.
+    """Last position and velocity of a person in the images.
 
     Args:
-        sighting: the first one.
+        sighting: first sighting.
         stamp: stamp of its image, ns.
 
     Attributes:
-        sighting: the last one.
-        stamp: of its image, ns.
+        sighting: last sighting.
+        stamp: stamp of its image, ns.
         velocity: (2,) px/s.
-        size: of the person, px; it does not shrink at once when a part is hidden for a while.
+        size: size of the person, px; it shrinks slowly when a part of the person is hidden.
     """
 
     def __init__(self, sighting: Sighting, stamp: int) -> None:
@@ -95,11 +96,11 @@ class ImageTrack:
         self._known_for = 0.0
 
     def update(self, sighting: Sighting, stamp: int) -> None:
-        """Replaces the last sighting by one in a later image."""
+        """Updates the track with a sighting in a later image."""
         dt = seconds(stamp - self.stamp)
         moved = np.median(self.sighting.shifts_to(sighting), axis=0)
         self._known_for += dt
-        # The mean over all sightings at first, and over the last moments later.
+        # At first the mean over all sightings, later the mean over the last moments.
         gain = min(dt / min(self._known_for, VELOCITY_TIME), 1.0)
         self.velocity += gain * (moved / dt - self.velocity)
         self.size = max(sighting.size, self.size * float(elementary.exp(-dt / EXPECTED_TIME)))
@@ -111,19 +112,19 @@ class ImageTrack:
         return np.asarray(dt * self.velocity)
 
     def cost(self, sighting: Sighting, stamp: int) -> float:
-        """Distance of a sighting from where the person is expected, in sizes of the person."""
+        """Distance of a sighting from the expected position, in sizes of the person."""
         off = self.sighting.shifts_to(sighting) - self.shift(stamp)
         return float(np.median(elementary.hypot(*off.T))) / self.size
 
     def gate(self, stamp: int) -> float:
-        """Cost from which a sighting shows somebody else."""
+        """Cost from which a sighting is another person."""
         return GATE * (1.0 + min(seconds(stamp - self.stamp) / EXPECTED_TIME, 1.0))
 
 
 def assigned(
     tracks: Sequence[ImageTrack], sightings: Sequence[Sighting], stamp: int
 ) -> dict[int, int]:
-    """Index of the sighting by index of the track, for tracks that have one."""
+    """Indices of the assigned sightings by index of the track, for tracks with a sighting."""
     if not tracks or not sightings:
         return {}
     costs = np.array([[track.cost(each, stamp) for each in sightings] for track in tracks])
@@ -141,8 +142,8 @@ def unknown_area(mine: Mask, nearer: Sequence[Mask], farther: Sequence[Mask]) ->
     """Pixels (H, W) without evidence about a person; None if missing.
 
     Args:
-        mine: (H, W) that the person covers.
-        nearer, farther: areas of the people in front of and behind the person.
+        mine: (H, W) pixels that the person covers.
+        nearer, farther: areas (H, W) of the people in front of and behind the person.
     """
     result = np.zeros_like(mine)
     for area in nearer:
@@ -153,7 +154,7 @@ def unknown_area(mine: Mask, nearer: Sequence[Mask], farther: Sequence[Mask]) ->
 
 
 def hull(sighting: Sighting, shape: tuple[int, ...]) -> Mask:
-    """Pixels (H, W) in the hull of somebody's joints, or in the box, with a margin."""
+    """Pixels (H, W) in the hull of a person's joints, or else in the box, with a margin."""
     joints = np.array(list(sighting.joints.values()))
     if len(joints) < 3:
         (left, top), (right, bottom) = sighting.corners.tolist()

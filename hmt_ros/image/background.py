@@ -2,17 +2,17 @@
 
 The background is either a given image of the empty scene or learned from frames in which the person
 is absent or moves. A model of the table `BACKGROUNDS` does the per-pixel work, on images reduced
-to about `LINES` lines: the cost does not depend on the camera, and the outline is interpolated to a
-fraction of their pixels. A useless background is rebuilt from the pixels of images where the person
-is not.
+to about `LINES` lines, so that the cost does not depend on the camera. The outline is interpolated
+to subpixels of these images. A background that shows the person is rebuilt from pixels of later
+images that the person does not cover.
 
-`SceneWatch` checks whether the camera still sees the scene from where the background was taken:
+`SceneWatch` checks whether the camera has moved since the background was taken:
 
     r(s) = normalised cross-correlation of |grad background| with |grad image|, shifted by s
 
 on images that are `WIDTH` px wide, for shifts of up to `REACH`. The maximum is at s = 0 as long as
-the camera has not moved, even if people walk in front of it or the light changes: edges stay where
-they are. After a bump the maximum is elsewhere; after a larger one no shift fits.
+the camera has not moved, even if people walk in front of it or the light changes, because edges
+stay in place. After a small movement the maximum is elsewhere; after a larger one no shift fits.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from hmt_ros.inference.arrays import Image, Mask
 
 Box = tuple[int, int, int, int]
 
-# Makers of models of the empty scene, by the values of `BackgroundSettings.method`. A new model is
-# a file beside this one and a line here.
+# Constructors of background models, by `BackgroundSettings.method`. A new model needs a file of its
+# own and a line here.
 BACKGROUNDS: dict[str, Callable[[float, float], Background]] = {
     'mog2': mixture_background,
     'knn': neighbour_background,
@@ -47,14 +47,14 @@ BACKGROUNDS: dict[str, Callable[[float, float], Background]] = {
 # Approximate number of lines of reduced images; they are reduced by an integer factor.
 LINES = 240
 
-# Tolerance of a pixel against the background colours around it, grey levels: compression and
-# aliasing move edges.
+# Tolerance when a pixel is compared with the neighbouring pixels of the background, grey levels,
+# because compression and aliasing move edges.
 BESIDE = 8
 # Number of images without the person that must agree before a pixel is known again, and tolerance
 # of this agreement, grey levels.
 AGREEING = 10
 AGREEMENT = 20.0
-# Margin around a mask that morphological operations on it may reach, px.
+# Margin around a mask for morphological operations on it, px.
 AROUND = 2
 
 
@@ -95,8 +95,8 @@ class Silhouette(NamedTuple):
 
     Attributes:
         foreground: (H, W) pixels of the person.
-        unsure: (H, W) pixels darker than the background in the same colour: a shadow, or clothes
-            in the colours of the scene; None if missing.
+        unsure: (H, W) darker pixels of the same colour as the background: a shadow, or clothes in
+            the colours of the scene; None if missing.
     """
 
     foreground: Mask
@@ -120,7 +120,7 @@ class BackgroundModel:
         self.changed = 0.0
         self._shape: tuple[int, ...] = ()
         self._nearby: tuple[Image, Image] | None = None
-        # The last image and its labels: several people share one background.
+        # Cache of the last image and its labels, because several people share one background.
         self._last: tuple[Image, Image] | None = None
         self._parts: _Parts | None = None
 
@@ -128,7 +128,7 @@ class BackgroundModel:
     def from_image(
         cls, background: Image, settings: BackgroundSettings | None = None
     ) -> BackgroundModel:
-        """A model of one image of the empty scene, (H, W, 3) uint8."""
+        """A model learned from one image of the empty scene, (H, W, 3) uint8."""
         model = cls(settings)
         model._learn_alone(background)
         return model
@@ -137,7 +137,7 @@ class BackgroundModel:
         """Adds a frame (H, W, 3) of the scene to the model.
 
         Raises:
-            ValueError: the image has another shape than those before.
+            ValueError: the image differs in shape from earlier images.
         """
         if self.frames == 0:
             self._shape = image.shape
@@ -147,7 +147,7 @@ class BackgroundModel:
         self._nearby = self._last = None
 
     def forget(self) -> None:
-        """Forgets all that was learned; `complete` rebuilds the background."""
+        """Forgets the background, which `complete` then rebuilds."""
         shape = self._shape
         if self.frames == 0:
             return
@@ -155,10 +155,10 @@ class BackgroundModel:
         self._learn_alone(np.zeros(shape, dtype=np.uint8))
 
     def complete(self, image: Image, person: Mask) -> None:
-        """Learns the unknown pixels from an image where the person (H, W) is not.
+        """Learns unknown pixels of the background where the person (H, W) does not cover them.
 
         Raises:
-            ValueError: the image has another shape than those before.
+            ValueError: the image differs in shape from earlier images.
         """
         self._check(image)
         if self._parts is None:
@@ -170,12 +170,12 @@ class BackgroundModel:
 
     @property
     def unknown(self) -> Mask | None:
-        """Pixels (H, W) not yet seen without the person since `forget`; None if missing."""
+        """Pixels (H, W) not yet seen without the person since `forget`; None if all are known."""
         return None if self._parts is None else self._parts.unknown
 
     @property
     def empty(self) -> Image:
-        """The empty scene (h, w, 3), as far as it is known, reduced as all images are."""
+        """The empty scene (h, w, 3) as far as it is known, at the size of the reduced images."""
         return self._model.empty
 
     def foreground(self, image: Image) -> Mask:
@@ -191,7 +191,7 @@ class BackgroundModel:
     def silhouette(self, image: Image, region: Box | None = None) -> Mask:
         """Foreground (H, W) of an image: the largest piece and pieces near it, without shadow.
 
-        Empty where nothing differs from the background. The model does not change.
+        Empty if nothing differs from the background. The model does not change.
 
         Args:
             image: (H, W, 3) uint8.
@@ -249,7 +249,7 @@ class BackgroundModel:
         return raw
 
     def _beside(self, image: Image) -> Image:
-        """255 (h, w) where the background has the colour in a neighbouring pixel, else 0."""
+        """255 where a pixel (h, w) has the colour of a neighbouring background pixel, else 0."""
         if self._nearby is None:
             empty = self.empty
             square = np.ones((3, 3), np.uint8)
@@ -268,7 +268,7 @@ class BackgroundModel:
         return max(round(self._shape[0] / LINES), 1)
 
     def _smaller(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """An image (H, W) or (H, W, 3), reduced; a pixel is the mean of those that it replaces."""
+        """Reduces an image (H, W) or (H, W, 3) by averaging blocks of pixels."""
         if self._factor == 1:
             return image
         size = tuple(-(-x // self._factor) for x in image.shape[1::-1])
@@ -305,14 +305,14 @@ class BackgroundModel:
         return left // factor, top // factor, -(-right // factor), -(-bottom // factor)
 
     def _learn_alone(self, background: Image) -> None:
-        """Replaces all that was learned by one image (H, W, 3) of the empty scene."""
+        """Replaces the background by one image (H, W, 3) of the empty scene."""
         self._model = self.settings.new_model()
         self.frames = 0
         for _ in range(self._model.repeats):
             self.learn(background)
 
     def _check(self, image: Image) -> None:
-        # OpenCV would silently begin a new model.
+        # OpenCV would silently start a new model if the shape changed.
         if image.shape != self._shape:
             raise ValueError(f'the background has shape {self._shape}, saw an image {image.shape}')
 
@@ -324,7 +324,7 @@ class _Parts:
         shape: (H, W, 3) of the images.
 
     Attributes:
-        unknown: (H, W).
+        unknown: (H, W) pixels that are not known yet.
         changed: whether pixels have become known since this was last set to False.
     """
 
@@ -340,11 +340,11 @@ class _Parts:
         return np.asarray(np.rint(self._mean), dtype=np.uint8)
 
     def add(self, image: Image, empty: Mask) -> None:
-        """Learns the unknown pixels from an image where the scene is empty (H, W)."""
+        """Learns unknown pixels from an image, at pixels (H, W) where the scene is empty."""
         rows, columns = np.nonzero(empty & self.unknown)
         values = image[rows, columns].astype(np.float32)
         mean, agreeing = self._mean[rows, columns], self._agreeing[rows, columns]
-        # Pixels that disagree start again: somebody was there before, or is there now.
+        # Pixels that disagree start again, because a person was there before or is there now.
         agreeing[np.abs(values - mean).max(1, initial=0.0) > AGREEMENT] = 0
         agreeing += 1
         self._mean[rows, columns] = mean + (values - mean) / agreeing[:, None]
@@ -355,7 +355,7 @@ class _Parts:
 
 
 def one_person(mask: Mask, settings: BackgroundSettings, region: Box | None = None) -> Mask:
-    """The largest piece of a mask (H, W) and those large and near enough to belong to it."""
+    """The largest piece of a mask (H, W), with pieces large and near enough to belong to it."""
     result = np.zeros(mask.shape, dtype=np.bool_)
     inside = _around(mask, region)
     part = mask[inside]
@@ -366,7 +366,7 @@ def one_person(mask: Mask, settings: BackgroundSettings, region: Box | None = No
 
 
 def pieces_of(mask: Mask) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Labels (H, W) of the connected pieces of a mask, and their statistics (N, 5) by OpenCV."""
+    """Labels (H, W) of the connected pieces of a mask, and OpenCV's statistics of them (N, 5)."""
     pixels = np.ascontiguousarray(mask).view(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
         pixels, 8, cv2.CV_32S, cv2.CCL_BBDT
@@ -378,8 +378,8 @@ def of_one_person(stats: NDArray[np.int32], settings: BackgroundSettings) -> Mas
     """Which pieces (N,) of a mask belong to its largest one; piece 0 is the background.
 
     Args:
-        stats: (N, 5) statistics of the pieces by OpenCV.
-        settings: how large and near they have to be.
+        stats: (N, 5) OpenCV's statistics of the pieces.
+        settings: minimum size of a piece, and maximum distance from the largest piece.
     """
     area = stats[:, cv2.CC_STAT_AREA]
     main = 1 + int(np.argmax(area[1:]))
@@ -395,7 +395,7 @@ def of_one_person(stats: NDArray[np.int32], settings: BackgroundSettings) -> Mas
 def _around(pixels: NDArray[np.bool_ | np.uint8], region: Box | None = None) -> tuple[slice, slice]:
     """Rows and columns that bound the nonzero pixels of a region (None: all), with a margin.
 
-    They are empty if all pixels are 0. They save time because most of an image is empty.
+    They are empty if all pixels are 0. They save time, because most of an image is empty.
     """
     left, top, right, bottom = region or (0, 0, pixels.shape[1], pixels.shape[0])
     part = pixels[top:bottom, left:right].view(np.uint8)
@@ -411,16 +411,16 @@ def _around(pixels: NDArray[np.bool_ | np.uint8], region: Box | None = None) -> 
 WIDTH, REACH = 320, 24
 # Maximum gradient length; standard deviation of the Gaussian before the derivative, px.
 STRONGEST, SMOOTHING = 200.0, 1.0
-# Interval between examined images, and number of these in a row that must agree.
+# Number of images per examined one, and number of successive examined images that must agree.
 EVERY, IN_A_ROW = 10, 2
-# Minimum correlation that counts, and its minimum excess over the one without a shift.
+# Minimum correlation at the best shift, and its minimum excess over the correlation at shift 0.
 LEAST, MARGIN = 0.3, 0.05
-# Fraction of the first correlation without a shift below which the scene is another.
+# Correlation at shift 0, as a fraction of its first value, below which the scene has changed.
 LEFT = 0.4
 
 
 class SceneWatch:
-    """Detects that a camera that should not move has moved.
+    """Detects movement of a camera that should stand still.
 
     Attributes:
         moved: whether the camera has moved since the background was taken.
@@ -437,7 +437,7 @@ class SceneWatch:
         self._usual = 0.0
 
     def look(self, image: Image, background: BackgroundModel) -> None:
-        """Compares an image (H, W, 3) with a background, unless part of that is unknown."""
+        """Compares an image (H, W, 3) with a background, unless this is partly unknown."""
         self._count += 1
         if self._count % EVERY != 1 or background.unknown is not None:
             return
@@ -455,7 +455,7 @@ class SceneWatch:
 
 
 def edges_of(image: Image) -> NDArray[np.float32]:
-    """Lengths (h, w) of the gradients of an image (H, W, 3), at `WIDTH`."""
+    """Gradient magnitudes (h, w) of an image (H, W, 3) that is reduced to `WIDTH`."""
     height = max(round(image.shape[0] * WIDTH / image.shape[1]), 2 * REACH + 8)
     small = cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(small, (0, 0), SMOOTHING)
@@ -468,7 +468,7 @@ def edges_of(image: Image) -> NDArray[np.float32]:
 def _correlation(
     background: NDArray[np.float32], image: NDArray[np.float32]
 ) -> tuple[float, float, float]:
-    """Length of the best shift, px; the correlation there; and the one without a shift."""
+    """Length of the best shift, px, the correlation at this shift, and that at shift 0."""
     inner = background[REACH:-REACH, REACH:-REACH]
     found = np.nan_to_num(cv2.matchTemplate(image, inner, cv2.TM_CCOEFF_NORMED))
     row, column = np.unravel_index(int(found.argmax()), found.shape)

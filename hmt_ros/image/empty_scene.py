@@ -1,17 +1,17 @@
-"""The empty scene before a camera that stands still, and whether somebody was in it.
+"""The empty scene of a camera that stands still, and checks whether it contained a person.
 
-A background that was given is the empty scene. One that is learned from images is not, if somebody
-stood in them: the person is missing in the silhouettes, and leaves a ghost in the place. Both look
-like silhouettes, so nothing derived from silhouettes shows the fault. Two other cues do:
+A given background is the empty scene. A background that is learned from images shows a person who
+stood still in them. Silhouettes then lack this person, and contain a ghost in the person's place.
+Both look like correct silhouettes, so the fault is found by other cues:
 
     still     log odds -= dt / STILL          people move; a scene in which nothing does is empty
     moved     log odds = 0, learned again     a piece as large as a part of a person has changed
     outline   log odds -= a(dt) N (u - m)     u: share of the outline of a silhouette at which the
                                               image has the stronger edges, not the background
 
-The log odds are those of somebody in the scene as it was learned. A person in front of a scene
-covers its edges; a ghost has its edges in the background. If a detector sees nobody, less time is
-needed, and things that move are not taken for a person.
+The log odds are for a person in the learned scene. A person in front of a scene covers its edges; a
+ghost has its edges in the background. If a detector sees nobody, less time is needed, and moving
+objects are not taken for a person.
 """
 
 from __future__ import annotations
@@ -31,33 +31,33 @@ UNSEEN = (
     'the scene has not been seen empty and still for two seconds; wanted that, or background_file, '
     'or a detector (use_keypoints, or "install-detector")'
 )
-# Time for which somebody in view keeps still, and for which a detector fails to see them as well,
-# s; maximum change of the log odds by one image, nats.
+# Time constant of a person who keeps still, and of a still person whom a detector misses, s;
+# maximum change of the log odds in one image, nats.
 STILL, UNDETECTED, MOST = 0.4, 0.1, 3.5
-# Log odds of somebody in the scene: maximum for silhouettes to be used, minimum without any
-# silhouette (somebody may sleep, or be a picture), and value below which none is judged, nats.
+# Log odds of a person in the scene, nats: maximum for silhouettes to be used; minimum due to
+# stillness alone, because a person may sleep; value below which silhouettes are no longer judged.
 KNOWN, STILLEST, SURE = -3.5, -5.0, -14.0
 # Blur of compared images, px; time constant of their mean, s; minimum change of a pixel that is not
-# noise, grey levels; minimum size of a piece that is part of a person, as a fraction of the image
-# (in empty scenes up to 6e-5; of people who stand 2e-4 to 3e-3 in half a second).
+# noise, grey levels; minimum size of a changed piece that is part of a person, as a fraction of the
+# image (measured: up to 6e-5 in empty scenes, 2e-4 to 3e-3 within 0.5 s for people who stand).
 BLUR, MEMORY, CHANGED, PIECE = 1.5, 1.0, 10.0, 2e-4
-# N, m, time for which errors of the outline last, s, and minimum length of the outline, px. On nine
-# rendered clips u is 0.85 to 1 with the empty scene as background, and 0.25 to 0.66 with their
+# N, m, time constant of errors of the outline, s, and minimum length of the outline, px. On nine
+# rendered clips u is 0.85 to 1 if the background is the empty scene, and 0.25 to 0.66 if it is the
 # first image, until the person has left the place of the ghost.
 NATS, UNDECIDED, TAU, OUTLINE = 16.0, 0.75, 0.2, 40
 
 
 class EmptyScene:
-    """Learns the empty scene, and checks whether somebody is in it.
+    """Learns the empty scene, and checks whether it contains a person.
 
     Args:
-        background: that was given, or a model that has learned nothing.
-        trusted: whether the background is learned, and checked, elsewhere.
+        background: a given background, or a model that has seen no image.
+        trusted: whether the background is learned and checked elsewhere.
 
     Attributes:
-        background: the scene as it is known.
-        seen: whether it was seen long enough for silhouettes, which are judged from then on.
-        log_odds: log odds of somebody in it, nats.
+        background: the learned scene.
+        seen: whether the scene was seen for long enough; silhouettes are then used and judged.
+        log_odds: log odds of a person in the learned scene, nats.
     """
 
     def __init__(self, background: BackgroundModel, *, trusted: bool = False) -> None:
@@ -71,26 +71,26 @@ class EmptyScene:
 
     @property
     def known(self) -> bool:
-        """Whether it was seen, and nobody is in it."""
+        """Whether the scene was seen for long enough and contains nobody."""
         return self.background.frames > 0 and self.seen and self.log_odds < KNOWN
 
     @property
     def wants(self) -> str:
-        """Message about what silhouettes still need; '' if nothing."""
+        """Message about missing input for silhouettes; '' if nothing is missing."""
         return '' if self.known else UNSEEN
 
     @property
     def is_of_somebody(self) -> bool:
-        """Whether it was seen, and somebody is more likely than not in it."""
+        """Whether the scene was seen for long enough and probably contains a person."""
         return self.seen and self.log_odds > 0.0
 
     def learn(self, image: Image, stamp: int, detected: bool | None = None) -> None:
-        """Learns from an image (H, W, 3), unless a detector sees somebody in it.
+        """Learns from an image (H, W, 3), unless a detector sees a person in it.
 
         Args:
-            image: of the scene.
-            stamp: of the image, ns; later than the one before.
-            detected: whether a detector, or a segmenter, sees somebody; None if unknown.
+            image: image of the scene.
+            stamp: stamp of the image, ns, later than the previous one.
+            detected: whether a detector or a segmenter sees a person; None if unknown.
         """
         if self.log_odds == -math.inf or detected:
             return
@@ -107,7 +107,7 @@ class EmptyScene:
         self.background.learn(image)
 
     def judge(self, image: Image, stamp: int) -> None:
-        """Updates the log odds by the outline of the silhouette in an image (H, W, 3)."""
+        """Updates the log odds from the outline of the silhouette in an image (H, W, 3)."""
         if not self.seen or self.log_odds <= SURE:
             return
         now, size = edges_of(image), image.shape[1::-1]
@@ -127,7 +127,7 @@ class EmptyScene:
         self._judged = stamp
 
     def _has_moved(self, image: Image, dt: float) -> bool:
-        """Whether a part of a person has moved since the images before."""
+        """Whether a part as large as that of a person has moved since earlier images."""
         width = min(WIDTH, image.shape[1])
         height = max(round(image.shape[0] * width / image.shape[1]), 1)
         resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)

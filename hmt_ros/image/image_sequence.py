@@ -1,15 +1,16 @@
-"""The images of a sequence themselves as observations of a motion: p(r_t | x_t) (VMS 5).
+"""Likelihood p(r_t | x_t) of the images of a sequence, as observations of a motion (VMS 5).
 
     E_t(x) = a_i E_image(x) + E_keypoints(x; a_k, a_l) + a_p (E_prior(x) + E_known(x))
 
-Errors of images last, so a cue g of an image counts with its share a_g of the time since the image
-before (`inference.error_model`), as in the filter; an exchange of sides counts whole. Along a
-motion a lasting error does no harm: by `of_changes` the terms of the image count with their share
-of changes, and covariances grow by `CueErrors.lasting` afterwards. Keypoints count as before: their
-errors drift, and a motion would follow them.
+Errors of images persist, so the energy of a cue g is multiplied by a share a_g, which depends on
+the time since the previous image (`inference.error_model`), as in the filter; the prior of an
+exchange of sides is not scaled. A persistent error does not change the shape of a motion. If
+`of_changes` is set, the terms of the image are therefore scaled by `CueErrors.of_changes` instead,
+and covariances are enlarged by `CueErrors.lasting` afterwards. The share of keypoints stays the
+same, because their errors drift, and a motion would follow the drift.
 
-Each image has the lengths and the flesh that its own poses were found with: later estimates of
-these move the root along the line of sight, which neighbouring images would take for motion.
+Each image keeps the bone lengths and the flesh with which its own poses were estimated. Later
+estimates of these move the root along the line of sight, which would look like motion.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ from hmt_ros.inference.error_model import ERRORS, seconds
 
 @dataclass(frozen=True, eq=False)
 class SeenImage:
-    """The evidence of one image about a person, as far as it is believed.
+    """The believed evidence of one image about a person.
 
     Attributes:
         likelihood: likelihood of images of this person.
         observation: evidence of the image.
-        known: further terms of the pose: gravity, floor.
+        known: further terms of the pose, for gravity and floor.
     """
 
     likelihood: ImageLikelihood
@@ -46,7 +47,7 @@ class SeenImage:
     known: tuple[FrameTerm | GroundTerm, ...] = ()
 
     def levelled(self, level: Array) -> SeenImage:
-        """The same image for poses whose root angles are relative to other axes."""
+        """The same image for poses whose root angles are relative to the axes `level`."""
         body = self.likelihood.body
         if np.array_equal(body.level, level):
             return self
@@ -59,7 +60,7 @@ class ImageSequence:
 
     Attributes:
         images: the T images.
-        shares: shares a_g of each image, by name of the cue.
+        shares: shares a_g by name of the cue, for each image.
     """
 
     images: Sequence[SeenImage]
@@ -69,10 +70,10 @@ class ImageSequence:
     def of(
         cls, images: Sequence[SeenImage], stamps_ns: Sequence[int], *, of_changes: bool = False
     ) -> ImageSequence:
-        """The sequence of images with these stamps (T,); nothing was seen before the first.
+        """The sequence of images with these stamps (T,), without evidence before the first image.
 
         Args:
-            of_changes: whether the terms of the image count with their share of changes.
+            of_changes: whether `CueErrors.of_changes` gives the share of the terms of the image.
         """
         intervals = [np.inf, *(seconds(b - a) for a, b in pairwise(stamps_ns))]
         shares = [
@@ -110,7 +111,7 @@ class ImageSequence:
 
     @cached_property
     def _terms(self) -> list[list[tuple[PoseEnergy, float]]]:
-        """The sums of terms of each time, and the factors on them."""
+        """Sums of terms and the factors on them, for each time."""
         result = []
         for image, share in zip(self.images, self.shares, strict=True):
             # Callers may run in several threads, which already use all cores.
@@ -125,7 +126,7 @@ class ImageSequence:
 
 
 def _scaled(energy: Energy, factor: float) -> Energy:
-    """An energy times a factor."""
+    """An energy and its derivatives, times a factor."""
     value, gradient, hessian = energy
     if gradient is None or hessian is None:
         return Energy(factor * value)

@@ -1,11 +1,12 @@
 """Depths of joints with known pixels from a depth image, for the start of a track.
 
-A joint lies behind the skin that its pixel shows, by about the radius of the flesh there:
+A joint lies behind the skin at its pixel, approximately by the radius of the flesh there:
 
     z_j = D(u_j) + r_j +- sigma_j,   sigma_j^2 = (r_j / 2)^2 + DEPTH_SIGMA^2
 
-D is a low quantile of the depths around the pixel, as limbs are thin and the background is behind
-them. An object in front of the joint, or a depth beside it, is an outlier; kernels are robust.
+D is a low quantile of the depths around the pixel, because limbs are thin and the background is
+behind them. Depths of an object in front of the joint, or of a neighbouring surface, are outliers,
+so the kernel is robust.
 """
 
 from __future__ import annotations
@@ -24,20 +25,21 @@ from hmt_ros.image.terms.depth import usable_depths
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Index
 
-# Margin of the window around the pixel of a joint, px, and quantile of the depths in it.
+# Margin of the window around the pixel of a joint, px, and quantile of the depths in this window.
 MARGIN, DEPTH_QUANTILE = 2, 0.25
-# Standard deviation of the depth of a joint besides its flesh, m.
+# Standard deviation of the depth of a joint, apart from the error of the flesh, m.
 DEPTH_SIGMA = 0.03
 # Width of the Geman-McClure kernel, in standard deviations.
 KERNEL_SCALE = 4.0
-# Minimum number of points of the trunk with a depth that locate a person.
+# Minimum number of trunk points with a depth to locate a person.
 MIN_JOINTS = 3
-# Quantile of their depths, below the median as the background is behind; number of iterations.
+# Quantile of the depths of trunk points, below the median because the background is behind, and
+# number of iterations.
 TRUNK_QUANTILE, ITERATIONS = 0.35, 2
 
 
 def depths_of(depth: NDArray[np.floating] | None) -> ImageMap | None:
-    """The map of a depth image (H, W), m; None if nothing was measured."""
+    """A depth image (H, W), m, as an `ImageMap`; None if no pixel was measured."""
     if depth is None:
         return None
     usable = usable_depths(depth)
@@ -51,7 +53,7 @@ class JointDepths:
     Attributes:
         joints: (M,) joints of the skeleton.
         depths: (M,) along the axis of the camera, m.
-        sigma: (M,) their standard deviations, m.
+        sigma: (M,) standard deviations of the depths, m.
     """
 
     joints: Index
@@ -59,7 +61,7 @@ class JointDepths:
     sigma: Array
 
     def residuals(self, depths: Array) -> tuple[Array, Array, Array]:
-        """Energies (M,) of depths (M,) of the joints, m, and their derivatives and curvatures."""
+        """Energies (M,) of joint depths (M,), m, with their derivatives and curvatures."""
         error = (depths - self.depths) / self.sigma
         shrink = 1.0 / (1.0 + (error / KERNEL_SCALE) ** 2)
         curvature = shrink**2 / self.sigma**2
@@ -67,7 +69,7 @@ class JointDepths:
 
 
 def joint_depths(body: Body, keypoints: Keypoints, depths: ImageMap | None) -> JointDepths:
-    """Depths of the joints that keypoints show, where something was measured."""
+    """Depths of the joints of seen keypoints, where the depth image has measurements."""
     shown = np.flatnonzero(keypoints.seen) if depths is not None else np.zeros(0, np.intp)
     joints = body.skeleton.joint_index([keypoints.names[i] for i in shown])
     radii = _radii(body)[joints] if len(shown) else np.zeros(0)
@@ -78,7 +80,7 @@ def joint_depths(body: Body, keypoints: Keypoints, depths: ImageMap | None) -> J
 
 
 def moved_to_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap | None) -> Array:
-    """Poses (N, d) moved along their rays to where the depth image shows their trunks.
+    """Moves poses (N, d) along their rays to the measured depths of their trunks.
 
     A pose with too few measurements does not move.
     """
@@ -90,7 +92,7 @@ def moved_to_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap | 
     result = poses.copy()
     for _ in range(ITERATIONS):
         joints = body.joint_positions(result)[:, index]
-        # Joints of a pose that is too near lie beside the person; points nearer the middle may not.
+        # If a pose is too near, its joints may miss the person; points nearer the middle may not.
         inside = 0.5 * (joints + joints.mean(1, keepdims=True))
         for pose, points in zip(result, np.concatenate([joints, inside], axis=1), strict=True):
             skin = _depths_at(depths, camera.project(points))
@@ -106,7 +108,7 @@ def _depths_at(depths: ImageMap, pixels: Array) -> Array:
     values = depths.values[0]
     height, width = values.shape
     steps = np.arange(-MARGIN, MARGIN + 1)
-    # Clip pixels far outside, or behind the camera, to ones that are still outside.
+    # Clip pixels of points far outside or behind the camera; they stay outside the image.
     centres = np.clip(np.nan_to_num(pixels, nan=-1e6), -1e6, 1e6)
     columns, rows = (np.rint(centres) - [depths.left, depths.top]).astype(np.intp).T
     rows = (rows[:, None, None] + steps[:, None]).repeat(len(steps), axis=2)
@@ -121,7 +123,7 @@ def _depths_at(depths: ImageMap, pixels: Array) -> Array:
 
 
 def _radii(body: Body) -> Array:
-    """Radius (J,) of the flesh around each joint: that of the nearest ring of the body at rest."""
+    """Radius (J,) of the flesh at each joint, from the nearest ring of the body at rest."""
     rings, parts = body.flesh.rings, body.flesh.ring_parts
     if not len(parts):
         return np.zeros(len(body.joint_names))

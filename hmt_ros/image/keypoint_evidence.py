@@ -1,4 +1,4 @@
-"""Evidence of keypoints for a person in view, and whether a track can start from them."""
+"""Evidence of keypoints for a person in the image, and whether they can start a track."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from hmt_ros.inference.arrays import Array
 
 # Minimum number of keypoints of a person.
 FEWEST_KEYPOINTS = 6
-# Minimum confidence of a keypoint whose position is trusted.
+# Minimum confidence for the position of a keypoint to be trusted.
 MIN_CONFIDENCE = 0.5
-# Detectors find small people in the legs of a table and in leaves, with full confidence. Keypoints
-# of a person at this magnification, px/m, are no evidence; at twice this, they count in full.
+# Magnification, px/m, at which keypoints are no evidence of a person; at twice this value they are
+# full evidence. Detectors find small people in table legs and in leaves, with full confidence.
 MIN_MAGNIFICATION = 22.0
 
 
 def keypoint_evidence(keypoints: Keypoints, body: Body) -> float:
-    """Evidence of a detector for a person in view, from -1 (nobody) to 1.
+    """Evidence of a detector for a person in the image, from -1 (nobody) to 1.
 
-    It is 1 where the confidences have at least the sum of the fewest trusted keypoints that make a
-    person, and -1 below a third of that. With fewer joints, or for a person of a few pixels, it is
-    at most 0.
+    It is 1 if the sum of the confidences is at least that of the minimum number of keypoints at
+    minimum confidence, and -1 below a third of this sum. With fewer keypoints, or for a person of
+    few pixels, it is at most 0.
     """
     seen = keypoints.confidences[keypoints.seen]
     most = 0.0
@@ -36,9 +36,9 @@ def keypoint_evidence(keypoints: Keypoints, body: Body) -> float:
 
 
 def suffices(keypoints: Keypoints | None, body: Body) -> bool:
-    """Whether keypoints of one image fix place and facing direction of a person.
+    """Whether keypoints of one image determine position and facing of a person.
 
-    They must include all joints of the trunk, or all but one.
+    They must include all joints of the trunk, or all except one.
     """
     if keypoints is None:
         return False
@@ -49,7 +49,7 @@ def suffices(keypoints: Keypoints | None, body: Body) -> bool:
 
 
 def shows_a_part(keypoints: Keypoints | None, body: Body) -> bool:
-    """Whether keypoints show a person, and fix the facing direction."""
+    """Whether keypoints show a person, and determine the facing."""
     if keypoints is None or keypoint_evidence(keypoints, body) <= 0.0:
         return False
     names = _confident(keypoints)
@@ -62,7 +62,7 @@ def _confident(keypoints: Keypoints) -> set[str]:
 
 
 def _magnification(keypoints: Keypoints, body: Body) -> float:
-    """Approximate magnification, px/m: the extent of the joints over that of a standing person."""
+    """Approximate magnification, px/m, from the extent of the joints of a standing person."""
     standing = _standing(body)
     known = [i for i in np.flatnonzero(keypoints.seen) if keypoints.names[i] in standing]
     if not known:
@@ -74,6 +74,6 @@ def _magnification(keypoints: Keypoints, body: Body) -> float:
 
 @lru_cache(maxsize=8)
 def _standing(body: Body) -> dict[str, Array]:
-    """Positions (3,) of the joints of a person who stands, m."""
+    """Positions (3,) of the joints of a standing person, m, by name."""
     joints = body.joint_positions(body.prior_mean[None])[0]
     return dict(zip(body.joint_names, joints, strict=True))

@@ -1,4 +1,4 @@
-"""Keypoint schemes: names of the landmarks of a person by detector, and their places on a body.
+"""Keypoint schemes: the landmark names of detectors, and the places of landmarks on a body.
 
 A detector's "hip" is a point on the skin that annotators agreed on, not the centre of the joint.
 `keypoint_schemes.yaml` is the one table of names and offsets.
@@ -30,9 +30,10 @@ class Landmark:
 
     Attributes:
         name: canonical name.
-        joint: joint of our bodies at or near the landmark; '' if missing.
-        offset: (3,) from the joint in the frame of the joint's segment, m, of a person of 1.7 m.
-        sigma: standard deviation of each component of the offset over people, m.
+        joint: joint of the package's bodies at or near the landmark; '' if missing.
+        offset: (3,) from the joint to the landmark in the frame of the joint's segment, m, for a
+            person of 1.7 m.
+        sigma: standard deviation over people of each component of the offset, m.
     """
 
     name: str
@@ -56,7 +57,7 @@ class Scheme:
     landmarks: tuple[Landmark, ...]
 
     def landmark(self, name: str) -> Landmark | None:
-        """The landmark of a name; None if the scheme does not have it."""
+        """The landmark with this name; None if the scheme does not have the name."""
         return self.landmarks[self.names.index(name)] if name in self.names else None
 
 
@@ -96,16 +97,16 @@ def schemes() -> Mapping[str, Scheme]:
 
 @cache
 def unnamed_orders() -> Mapping[int, tuple[str, ...]]:
-    """Possible schemes of lists without names, the usual one first, by their number of points.
+    """Possible schemes of keypoints without names, the usual one first, by number of keypoints.
 
-    A scheme of fewer names covers the beginning of the list.
+    If a scheme has fewer names, they belong to the first keypoints.
     """
     return {int(count): tuple(names) for count, names in _table()['unnamed'].items()}
 
 
 @cache
 def bone_lengths() -> Mapping[tuple[str, str], tuple[float, float]]:
-    """Distances of two landmarks of a person of 1.7 m, m, and the deviation of their logarithm."""
+    """Distance of two landmarks of a 1.7 m person, m, and standard deviation of its logarithm."""
     return {
         (one.format(side=side), other.format(side=side)): (float(length), float(sigma))
         for one, others in _table()['bones'].items()
@@ -115,10 +116,10 @@ def bone_lengths() -> Mapping[tuple[str, str], tuple[float, float]]:
 
 
 def scheme_of(names: Sequence[str], scheme: str = AUTO) -> Scheme | None:
-    """The scheme of keypoints; None if their names are those of joints.
+    """The scheme of keypoints; None if their names are names of joints.
 
     Args:
-        scheme: name of a scheme, 'joints', or 'auto': see `recognised`.
+        scheme: name of a scheme, 'joints', or 'auto' for the result of `recognised`.
 
     Raises:
         ValueError: there is no such scheme.
@@ -135,9 +136,9 @@ def scheme_of(names: Sequence[str], scheme: str = AUTO) -> Scheme | None:
 
 
 def recognised(names: Sequence[str]) -> Scheme | None:
-    """The smallest scheme that has all of the names, if a face or a spine is among them.
+    """The smallest scheme that has all names, if the names include a nose or a spine.
 
-    Limbs and trunk have the same names in all schemes: without others they are names of joints.
+    Limbs and trunk have the same names in all schemes; alone, these are taken as names of joints.
     """
     fitting = [x for x in schemes().values() if set(names) <= set(x.names)]
     found = min(fitting, key=lambda x: len(x.names), default=None)
@@ -150,7 +151,7 @@ def landmarks_of(
     """The landmarks of keypoints by their names; None for a joint of the body or an unknown name.
 
     Args:
-        joints: of the body; outside schemes a name of one of them means this joint.
+        joints: names of the body's joints; without a scheme, a keypoint of such a name is a joint.
 
     Raises:
         ValueError: there is no such scheme.
@@ -163,13 +164,13 @@ def landmarks_of(
 
 
 def landmark_called(name: str) -> Landmark | None:
-    """The landmark of a name in the first scheme that has it; None if no scheme does."""
+    """The landmark with this name in the first scheme that has it; None if no scheme has it."""
     found = (scheme.landmark(name) for scheme in schemes().values())
     return next((landmark for landmark in found if landmark is not None), None)
 
 
 def noise_of(confidences: Array) -> Array:
-    """Standard deviations (n,) of keypoints of some confidences (n,), m at the person."""
+    """Standard deviations (n,) of keypoints from their confidences (n,), m at the person."""
     model = _table()['noise']
     result: Array = np.interp(confidences, model['confidence'], model['sigma'])
     return result
@@ -177,10 +178,11 @@ def noise_of(confidences: Array) -> Array:
 
 @cache
 def position_deviations(scheme: str | None) -> Mapping[str, float]:
-    """Standard deviations of depths of a detector, by the kind of the joint, m.
+    """Standard deviations of a detector's joint depths, by the kind of the joint, m.
 
     Args:
-        scheme: name of the detector's scheme; None or an unmeasured one gives the usual deviations.
+        scheme: name of the detector's scheme; None, or one without measured values, gives usual
+            values.
     """
     content = _table()['positions']
     return {**content['usual'], **content.get(scheme, {})}
@@ -188,13 +190,13 @@ def position_deviations(scheme: str | None) -> Mapping[str, float]:
 
 @cache
 def exchange_rates() -> Array:
-    """(E, E) rates per second at which a detector changes between exchanges of sides."""
+    """Rates (E, E), 1/s, at which a detector changes from one exchange of sides to another."""
     rates = np.array(_table()['exchanges']['rates'], dtype=np.float64)
     return rates - np.diag(rates.sum(1))
 
 
 @cache
 def usual_exchanges() -> Array:
-    """(1, E) log probability of each exchange, without knowledge of the images before."""
+    """Log probability (1, E) of each exchange, without information from earlier images."""
     at_first = np.array(_table()['exchanges']['at_first'], dtype=np.float64)
     return np.asarray(elementary.log(at_first)[None])

@@ -3,11 +3,11 @@
     p(y) = sum_c w_c prod_ja N(y_ja; m_cja, s_cja^2),    y_j: joint j from the middle of the hips
 
 The axes a lie across and along the line of sight to the person. Experts (`experts.lifter`) give
-several components; a network that estimates one pose gives one component without its uncertainty,
-which is learned (`keypoint_schemes.yaml`).
+several components. A network that estimates one pose gives one component without uncertainty; its
+standard deviations are learned (`keypoint_schemes.yaml`).
 
-Positions belong to a person of certain bone lengths. Only the directions of bones count: for
-another person every bone is scaled to that person's length.
+The estimated bone lengths need not be the person's. Only the directions of bones are used: every
+bone is scaled to its length in the body of the person.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ WHOLE = {
 # Standard deviation of a joint without an estimate, m.
 UNKNOWN = 0.5
 HIPS = ('left_hip', 'right_hip')
-# Parent of each kind of joint; the parent of all others is the middle of the hips.
+# Parent of each kind of joint; joints of other kinds have the middle of the hips as parent.
 CARRIERS = {
     'head': 'neck',
     'shoulder': 'neck',
@@ -55,12 +55,12 @@ class LiftedPoses:
     """A mixture over the joints of a person.
 
     Attributes:
-        joints: (J,) names of joints of our bodies.
-        log_weights: (C,) of the components.
-        means: (C, J, 3) from the middle of the hips, along the axes, m.
+        joints: (J,) names of joints of the package's bodies.
+        log_weights: (C,) log weights of the components.
+        means: (C, J, 3) positions relative to the middle of the hips, along the axes, m.
         deviations: (C, J, 3) standard deviations along the axes, m.
         axes: (3, 3) unit vectors in rows, camera frame; the last one is the line of sight.
-        lengths: (J,) of the bones from the parents to the joints in the means, m.
+        lengths: (J,) lengths in the means of the bones from the parents to the joints, m.
     """
 
     joints: tuple[str, ...]
@@ -78,11 +78,11 @@ class LiftedPoses:
 
     @property
     def are_whole(self) -> bool:
-        """Whether they determine a pose alone: only toes and hands may be missing."""
+        """Whether the joints determine a whole pose; only toes and hands can be missing."""
         return {*self.joints} >= WHOLE
 
     def of_joints(self, names: Sequence[str]) -> LiftedPoses:
-        """The mixture over some of the joints."""
+        """The mixture restricted to the named joints."""
         rows = [self.joints.index(name) for name in names]
         return LiftedPoses(
             tuple(names),
@@ -104,7 +104,7 @@ class LiftedPoses:
         return result
 
     def resized(self, other: LiftedPoses) -> Array:
-        """The means (C, J, 3) with the lengths of another mixture, where it has a joint."""
+        """The means (C, J, 3) with bone lengths of another mixture for the joints of both."""
         own = self.lengths.copy()
         rows, others = shared(self.joints, other.joints)
         own[rows] = other.lengths[others]
@@ -127,8 +127,8 @@ class LiftedPoses:
 def pooled(opinions: Sequence[LiftedPoses]) -> LiftedPoses:
     """One mixture from several estimates of one pose, with equal weights.
 
-    They use the same image, so they are not independent: the density is their mean. A joint that
-    an estimate lacks has the deviation `UNKNOWN` in its components.
+    The estimates use the same image, so they are not independent, and their densities are averaged.
+    A joint that an estimate lacks has the standard deviation `UNKNOWN` in its components.
     """
     first = opinions[0]
     if len(opinions) == 1:
@@ -154,16 +154,16 @@ def from_positions(
     deviations: Mapping[str, float],
     seen: Mask | None = None,
 ) -> LiftedPoses | None:
-    """The one pose that a network estimates; None if it lacks hips, or has nothing else.
+    """The pose that a network estimates; None if a hip or all other joints are missing.
 
     Args:
-        joints: (n,) names of joints; the first of equal names counts. A joint whose other side is
-            unknown does not count, because sides may be exchanged.
-        positions: (n, 3) m, along the axes of the camera from any origin; NaN: unknown.
+        joints: (n,) names of joints; the first of equal names is used. A joint is ignored if the
+            joint of the other side is unknown, because sides may be exchanged.
+        positions: (n, 3) positions along the axes of the camera, from any origin, m; NaN: unknown.
         axes: (3, 3) as in `LiftedPoses`.
-        deviations: standard deviations of the depths of joints by their kind, m.
-        seen: (n,) joints that the network has seen; the others have the deviation `UNKNOWN`. None:
-            all were seen.
+        deviations: standard deviations of joints by their kind, m.
+        seen: (n,) whether the network has seen a joint; other joints have the standard deviation
+            `UNKNOWN`. None: all were seen.
     """
     known: dict[str, int] = {}
     for i in np.flatnonzero(np.isfinite(positions).all(1)).tolist():
@@ -190,7 +190,7 @@ def from_positions(
 
 @lru_cache(maxsize=64)
 def shared(joints: tuple[str, ...], others: tuple[str, ...]) -> tuple[Index, Index]:
-    """Rows of the common joints in the first and in the second sequence."""
+    """Indices of the common joints in the first and in the second sequence."""
     rows = [(i, others.index(name)) for i, name in enumerate(joints) if name in others]
     own, theirs = np.array(rows, dtype=np.intp).reshape(-1, 2).T
     return own, theirs
@@ -198,7 +198,7 @@ def shared(joints: tuple[str, ...], others: tuple[str, ...]) -> tuple[Index, Ind
 
 @lru_cache(maxsize=64)
 def ordered(joints: tuple[str, ...]) -> Index:
-    """Rows (J, 2) of joints and their parents (-1: the middle of the hips), parents first."""
+    """Indices (J, 2) of joints and of their parents (-1: middle of the hips), parents first."""
     places = {name: i for i, name in enumerate(joints)}
     result: list[tuple[int, int]] = []
     done: set[str] = set()
@@ -218,7 +218,7 @@ def ordered(joints: tuple[str, ...]) -> Index:
 
 
 def carrier_of(name: str, joints: Sequence[str]) -> str:
-    """The nearest ancestor of a joint among some joints; '' for the middle of the hips."""
+    """The nearest ancestor of a joint in `joints`; '' for the middle of the hips."""
     side, _, kind = name.rpartition('_')
     carrier = CARRIERS.get(kind, '')
     while carrier:
@@ -231,7 +231,7 @@ def carrier_of(name: str, joints: Sequence[str]) -> str:
 
 @lru_cache(maxsize=16)
 def bone_lengths(skeleton: Skeleton, joints: tuple[str, ...]) -> Array:
-    """Lengths (J,) of the bones from the parents to the joints, at rest, m."""
+    """Lengths (J,) of the bones from the parents to the joints, in the rest pose, m."""
     places = forward(skeleton, np.zeros((1, skeleton.dimension))).joints()[..., 0]
     chosen: Index = skeleton.joint_index(joints)
     middle = places[skeleton.joint_index(HIPS)].mean(0)
@@ -239,7 +239,7 @@ def bone_lengths(skeleton: Skeleton, joints: tuple[str, ...]) -> Array:
 
 
 def bones(joints: tuple[str, ...], places: Array, origin: Array) -> Array:
-    """Bones (J, 3) to joints at places (J, 3) from their parents, or else from the origin."""
+    """Vectors (J, 3) to joints at places (J, 3) from their parents, or else from the origin."""
     rows, carriers = ordered(joints).T
     result = np.empty_like(places)
     result[rows] = places[rows] - np.where(carriers[:, None] < 0, origin, places[carriers])

@@ -2,8 +2,8 @@
 
     E(x) = sum_t E_t(x) + E_keypoints(x) + E_prior(x) + E_intersection(x)
 
-over the image terms t of `terms.registry`. `ImageLikelihood` makes the terms; `PoseEnergy` is the
-sum of some of them.
+over the image terms t of `terms.registry`. `ImageLikelihood` makes the terms; a `PoseEnergy` sums
+a selection of them.
 """
 
 from __future__ import annotations
@@ -84,15 +84,15 @@ LikelihoodSettings.__doc__ = '\n'.join(
 
 @dataclass(frozen=True, eq=False)
 class ImageLikelihood:
-    """The energy of poses of a body before a camera, given an image.
+    """The energy of poses of a body in front of a camera, given an image.
 
     Attributes:
         body, camera: the person, and the camera that sees the person.
         settings: settings of the terms.
-        parts: the parts of the flesh that are compared with the image; None: all.
-        occluders: the parts that hide others; None: all.
-        threads: number of threads that share poses; 0: one per core, see `in_threads`. Results do
-            not depend on it.
+        parts: indices of the parts of the flesh that are compared with the image; None: all.
+        occluders: indices of the parts that can hide others; None: all.
+        threads: number of threads that share the poses; 0: one per core, see `in_threads`. Results
+            do not depend on this number.
     """
 
     body: Body
@@ -112,7 +112,7 @@ class ImageLikelihood:
         """The terms of the image and of the keypoints.
 
         Args:
-            observation: of the image.
+            observation: evidence of the image.
             exchanges, share, lifted_share: as for `keypoint_term`.
         """
         image = observed(self, observation)
@@ -127,11 +127,11 @@ class ImageLikelihood:
         share: float = 1.0,
         lifted_share: float = 1.0,
     ) -> KeypointTerm:
-        """The term of the keypoints of an observation that has some.
+        """The keypoint term of an observation, which must have keypoints.
 
         Args:
-            exchanges: log probabilities of exchanges of sides, see `KeypointTerm`; None: the usual
-                ones of detectors.
+            exchanges: log probabilities of exchanges of sides, see `KeypointTerm`; None: those
+                of `usual_exchanges`.
             share: factor on the energy, but not on the prior of the exchanges.
             lifted_share: factor on the energy of lifted poses.
         """
@@ -166,11 +166,11 @@ class ImageLikelihood:
         return pose_prior(self.body, s.pose_prior, s.prior_weight)
 
     def recorded(self, frames: Frames, observation: Observation) -> Array:
-        """The residuals of the terms of contours and depths at the frames of N poses.
+        """The residuals of the image terms at the frames of N poses.
 
         Returns:
-            (N, 1 + M, RECORDED): rows 1 to m of a pose are their points and derivatives; m is the
-            first number of row 0.
+            (N, 1 + M, RECORDED): rows 1 to m of a pose are points and derivatives of the residuals;
+            m is the first number of row 0.
         """
         n = frames.count
         image = observed(self, observation)
@@ -203,10 +203,10 @@ class ObservedImage:
     """The image terms of an observation.
 
     Attributes:
-        likelihood: likelihood that the terms belong to.
+        likelihood: likelihood to which the terms belong.
         observation: evidence of the image.
-        explained: (N, M) or (1, M) maximum energy of each sample of the outline, which something
-            else may explain; None: unlimited.
+        explained: (N, M) or (1, M) maximum energy of each outline sample, because something else
+            may explain the sample; None: unlimited.
     """
 
     likelihood: ImageLikelihood
@@ -230,7 +230,7 @@ class ObservedImage:
 # Cached because an image is compared with many sets of poses, and with parts of the body.
 @lru_cache(maxsize=4)
 def _inputs(settings: LikelihoodSettings, observation: Observation) -> dict[str, Any]:
-    """The inputs of all terms of an image, and which of them are on."""
+    """The inputs of all terms of an image, whether any is on, and whether any needs the contour."""
     beliefs, result = observation.beliefs, []
     for term in TERMS:
         s: TermSettings = getattr(settings, term.name)

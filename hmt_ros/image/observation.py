@@ -1,4 +1,4 @@
-"""The evidence of one image for every term of the likelihood, once for all poses."""
+"""Evidence of one image for all terms of the likelihood, computed once for all poses."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hmt_ros.inference.threads import together
 
 Box = tuple[int, int, int, int]
 
-# Margin around the silhouette within which evidence is taken, px.
+# Margin of the evidence window around the silhouette, px.
 MARGIN = 48
 
 
@@ -34,8 +34,8 @@ class Beliefs:
         silhouette: probability of the silhouette.
         keypoints: (G,) probabilities of the groups of keypoints, see `terms.keypoints`.
         depth: probability of the depths.
-        segments: (S,) further factors on the parts of an image term, or of the keypoints, that
-            belong to each segment, by name of the term; without an entry all are 1.
+        segments: further factors (S,) on an image term, or on the keypoints, at each segment, by
+            name of the term; without an entry all are 1.
     """
 
     silhouette: float
@@ -57,18 +57,19 @@ class Observation:
     """An image and the evidence taken from it.
 
     Attributes:
-        silhouette: (H, W) foreground; None if unknown, or not believed.
+        silhouette: (H, W) foreground; None if unknown or disbelieved.
         keypoints: joints seen in the image; None if unknown.
         evidence: evidence by name of the term; terms without evidence in the image are left out.
-        foreground: (H, W) pixels that differ from the background, believed or not; None: unknown.
-        depths: m, believed or not; None: unknown.
-        flow: optical flow from the image before, two channels, px; None if missing.
-        others: (H, W) pixels that somebody else covers or may cover; None if missing.
-        hidden: (S,) segments that something else covers, so that the image is no evidence about
-            them; None if missing.
+        foreground: (H, W) pixels that differ from the background, even if disbelieved; None:
+            unknown.
+        depths: depth image, m, even if disbelieved; None: unknown.
+        flow: optical flow from the previous image, two channels, px; None if missing.
+        others: (H, W) pixels that other people cover or possibly cover; None if missing.
+        hidden: (S,) segments hidden by something else, about which the image is no evidence; None
+            if missing.
         beliefs: probabilities of the cues; None: all are believed.
-        magnification: px/m at the distance of the person; 0 if unknown: contours of people are then
-            assumed to equal the model's.
+        magnification: px/m at the distance of the person; 0 if unknown, so that contours of people
+            are assumed to equal the model's.
     """
 
     silhouette: Mask | None = None
@@ -113,12 +114,12 @@ def observe(
         image: (H, W, 3) BGR uint8.
         silhouette: (H, W) foreground; None or empty: the silhouette is not used.
         window: (left, top, right, bottom) where the person is expected, for images without a
-            silhouette; the whole image when None.
-        last_image: the image before, of the same size, that the optical flow starts from; None:
+            silhouette; None: the whole image.
+        last_image: the previous image, of the same size, from which the optical flow starts; None:
             the flow is not computed.
-        wanted: names of terms; None: all.
-        unsure: (H, W) pixels that may belong to the silhouette; None if missing.
-        others: (H, W) pixels that somebody else covers; None if missing.
+        wanted: names of the terms whose evidence is computed; None: all.
+        unsure: (H, W) pixels that possibly belong to the silhouette; None if missing.
+        others: (H, W) pixels that other people cover; None if missing.
         depth: (H, W) depth along the axis of the camera, m; None: unknown. 0, NaN and values out of
             range are no evidence.
 
@@ -134,13 +135,13 @@ def observe(
     known = silhouette if silhouette is not None and silhouette.any() else None
     box = window
     if known is not None:
-        # The person may be anywhere behind the others.
+        # The person can be anywhere behind the other people.
         box = _box(known if others is None else known | others)
     left, top, right, bottom = _grown(box, MARGIN, image.shape)
     inside = slice(top, bottom), slice(left, right)
 
     def cut(whole: NDArray[Any] | None) -> Any:
-        """The window of an array; a mask becomes 0 and 1."""
+        """Cuts the window out of an array; masks become 0 and 1."""
         if whole is None:
             return None
         part = np.ascontiguousarray(whole[inside])

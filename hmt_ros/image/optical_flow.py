@@ -2,8 +2,8 @@
 
     E(x) = w / Q sum_q rho(|u_q(x) - p_q - f(p_q)| / (sigma + 0.15 |f(p_q)|))
 
-Q points of the surface were seen at pixels p_q of the image before; the pose x moves them to
-u_q(x), and f is the flow (`core/flow.h`). Predictions follow the flow. It does not
+Q points of the surface were seen at pixels p_q of the previous image; the pose x moves them to
+u_q(x), and f is the flow (`core/flow.h`). The term improves the predictions of modes. It can not
 compare modes, because each mode has its own points.
 """
 
@@ -21,21 +21,21 @@ from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.image_term import ImageWindow
 
-# Minimum side of an image with a flow, px; the flow of smaller ones is 0.
+# Minimum side of an image for its flow to be computed, px; smaller images have flow 0.
 SMALLEST = 32
 
 
 def optical_flow(window: ImageWindow) -> ImageMap | None:
     """Dense flow from the last image to this one, two channels, px [Kroeger et al., ECCV 2016].
 
-    NaN on pixels of somebody else; None if there is no last image.
+    NaN on pixels of other people; None if there is no previous image.
     """
     if window.last_image is None:
         return None
     grey = [cv2.cvtColor(x, cv2.COLOR_BGR2GRAY) for x in (window.last_image, window.image)]
     if min(grey[0].shape) < SMALLEST:
         return window.as_map(np.zeros((2, *grey[0].shape), np.float32))
-    # The type stubs lack that the initial flow may be None.
+    # The type stubs do not allow None as initial flow.
     method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     with without_ipp():
         flow = method.calc(grey[0], grey[1], None)
@@ -48,7 +48,7 @@ def optical_flow(window: ImageWindow) -> ImageMap | None:
 
 @contextmanager
 def without_ipp() -> Iterator[None]:
-    """Disable Intel's IPP in OpenCV in this thread: it resizes differently between processors."""
+    """Disable Intel's IPP in OpenCV, whose resizing depends on the processor, in this thread."""
     before = cv2.ipp.useIPP()
     cv2.ipp.setUseIPP(False)
     try:
@@ -62,8 +62,8 @@ class FlowTerm:
     """The energy of poses against the flow.
 
     Attributes:
-        points: surface points of K poses in the image before, one pose per problem.
-        flow: flow from that image to this one.
+        points: surface points of K poses in the previous image, one pose per problem.
+        flow: flow from the previous image to this one.
         weight: w, number of independent measurements.
     """
 

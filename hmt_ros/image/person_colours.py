@@ -4,19 +4,19 @@
     B(x) = mean of p(M | colour) over a box at x        as large as the model
     score = (max B - elsewhere) / (here - elsewhere)
 
-M are the pixels that the model covers. `here` and `elsewhere` are the usual value of B where the
-person is, and its usual maximum over boxes beside the person: the score is about 1 where the image
-shows somebody in these colours anywhere, and about 0 in a room without the person. Colours are no
-evidence if the two are alike, or if the image has other colours than the images before it, as with
-a covered lens or another light.
+M are the pixels that the model covers. `here` is the usual value of B at the person, and
+`elsewhere` the usual maximum of B over boxes that do not touch the person. The score is near 1 if
+somebody in these colours is anywhere in the image, and near 0 in a room without the person. Colours
+are no evidence if the two values are similar, or if the image has other colours than earlier
+images, because the lens is covered or the light has changed.
 
-Their absence is evidence against the person only in the scene that they were learned in:
+Missing colours are evidence against the person only in the scene in which they were learned:
 
     stillness = 1 - changed pixels beyond the model / (LARGEST_CHANGE pixels of the model), >= 0
 
-After a change `elsewhere` belongs to another scene: the camera has moved, and the lost colours may
-be those of an object that the model covered. A person who moves beyond the model changes as many
-pixels. A colour that no earlier image had may belong to the person, who has turned around.
+After a change, such as a movement of the camera, `elsewhere` is from another scene, and the lost
+colours may be from an object that the model covered. A person who moves out of the model changes as
+many pixels. A colour that no earlier image had may belong to a person who has turned around.
 """
 
 from __future__ import annotations
@@ -34,28 +34,29 @@ from hmt_ros.inference.arrays import Array, Image, Mask
 
 # Time constant of the usual values of a person, s.
 MEMORY_TIME = 2.0
-# Time from one learning of the colours to the next, s: they hardly change.
+# Interval between updates of the colours, which hardly change, s.
 LEARNING_INTERVAL = 0.1
-# Changed pixels beyond the model above which the scene is another one, as a fraction of the pixels
-# not beyond it, or of those beyond it if they are fewer. A shadow moves with the person.
+# Changed pixels beyond the model that mean another scene, as a fraction of the pixels not beyond it
+# or, if fewer, of all pixels beyond it. It allows for the person's shadow.
 LARGEST_CHANGE = 0.25
-# Minimum difference between `here` and `elsewhere` that is evidence, a probability.
+# Minimum difference between the probabilities `here` and `elsewhere` for colours to be evidence.
 MIN_CONTRAST = 0.15
-# Bins of a colour channel, whose values are 0 to 255.
+# Number of bins of a colour channel with values from 0 to 255.
 BINS = 8
-# Minimum fraction of a model's pixels that change if the person moves, and maximum if nothing does.
+# Minimum changed pixels if the person moves, and maximum if nothing moves, as a fraction of the
+# model's pixels.
 MOVED_FRACTION, UNMOVED_FRACTION = 0.03, 0.005
-# Minimum ratio of the density of changes on a moving person to that elsewhere.
+# Minimum ratio of the density of changed pixels on a moving person to the density elsewhere.
 MOTION_DENSITY_RATIO = 8.0
-# Minimum standard deviation of the pixels of a model whose motion can be seen, grey levels.
+# Minimum standard deviation of the model's pixels for its motion to be visible, grey levels.
 MIN_MODEL_CONTRAST = 4.0
-# Difference in a channel above which a pixel has changed, grey levels; noise in means of 3 x 3
-# pixels of the raster is smaller.
+# Difference of a channel above which a pixel has changed, grey levels; larger than the noise of
+# means over 3 x 3 pixels of the raster.
 CHANGED_LEVELS = 24
 
 
 class Motion(NamedTuple):
-    """Changes since the image that was learned last.
+    """Changes since the last learned image.
 
     Attributes:
         moved: whether the pixels of the model have changed, and the rest of the image has not.
@@ -67,12 +68,12 @@ class Motion(NamedTuple):
 
 
 class Colours:
-    """The colours of one person against those of the surroundings.
+    """The colours of one person, compared with the colours of the surroundings.
 
     Attributes:
         size: (width, height) of the model, px of the raster.
-        here, elsewhere: usual means of p(M | colour) over a box at the person and over one beside;
-            NaN if unknown.
+        here, elsewhere: usual mean of p(M | colour) over a box at the person, and maximum of this
+            mean over boxes that do not touch the person; NaN if unknown.
     """
 
     def __init__(self) -> None:
@@ -80,7 +81,7 @@ class Colours:
         self.here = self.elsewhere = math.nan
         self._inside: Array | None = None
         self._around = self._scene = np.zeros(BINS**3)
-        # The last image that was learned, the pixels of the model in it, and those well beyond it.
+        # Last learned image, the pixels of the model in it, and pixels well beyond the model.
         self._image: Image | None = None
         self._model = self._beyond = np.empty((0, 0), np.bool_)
 
@@ -88,19 +89,19 @@ class Colours:
         """Score of the person's colours in an image (h, w, 3) BGR; None if undecided.
 
         Args:
-            image: on the raster.
-            unseen: p(M | colour) of a colour that no image has had.
+            image: image on the raster.
+            unseen: p(M | colour) for colours that no learned image had.
         """
         contrast = self.here - self.elsewhere
         if self._inside is None or not contrast >= MIN_CONTRAST:
             return None
         bins = binned(image)
-        if np.minimum(shares(bins), self._scene).sum() < 0.5:  # most of it has other colours
+        if np.minimum(shares(bins), self._scene).sum() < 0.5:  # most of the image has other colours
             return None
         return float((self._means(bins, unseen).max() - self.elsewhere) / contrast)
 
     def stillness(self, image: Image) -> float:
-        """Likeness, from 0 to 1, of an image (h, w, 3) to the scene that was learned last."""
+        """Similarity, from 0 to 1, of an image (h, w, 3) to the last learned scene."""
         if self._image is None:
             return 0.0
         changed, outside = self._changed(image), counted(self._beyond)
@@ -109,7 +110,7 @@ class Colours:
         return max(1.0 - share / LARGEST_CHANGE, 0.0)
 
     def motion(self, image: Image) -> Motion:
-        """Changes from the image that was learned last to an image (h, w, 3)."""
+        """Changes from the last learned image to an image (h, w, 3)."""
         model, other = counted(self._model), counted(self._beyond)
         if self._image is None or not model or image[self._model].std() < MIN_MODEL_CONTRAST:
             return Motion(moved=False, still=False)
@@ -121,7 +122,7 @@ class Colours:
         return Motion(moved, counted(changed) < UNMOVED_FRACTION * model)
 
     def _changed(self, image: Image) -> Mask:
-        """Pixels (h, w) that differ from the image that was learned last."""
+        """Pixels (h, w) that differ from the last learned image."""
         assert self._image is not None
         change = cv2.absdiff(cv2.blur(image, (3, 3)), self._image)
         return np.asarray(cv2.inRange(change, (0, 0, 0), (CHANGED_LEVELS,) * 3) == 0)
@@ -130,8 +131,8 @@ class Colours:
         """Learns from an image (h, w, 3) with the person on the pixels (h, w) of the model.
 
         Args:
-            image, model: on the raster.
-            dt: time since the last image that was learned, s.
+            image, model: image and mask on the raster.
+            dt: time since the last learned image, s.
         """
         outside = beyond(model)
         around = surroundings(model, outside)
@@ -155,7 +156,7 @@ class Colours:
         means = self._means(bins)
         row, column = y + height // 2, x + width // 2
         here = float(means[row, column])
-        # Boxes that do not touch that of the person.
+        # Exclude boxes that overlap with the person's box.
         means[max(row - height, 0) : row + height, max(column - width, 0) : column + width] = -1.0
         elsewhere = float(means.max())
         self.here = _moved(self.here, here, gain)
@@ -163,9 +164,9 @@ class Colours:
             self.elsewhere = _moved(self.elsewhere, elsewhere, gain)
 
     def _means(self, bins: NDArray[np.uint16], unseen: float = 0.0) -> NDArray[np.float32]:
-        """Mean of p(M | colour) over a box at each pixel (h, w); beyond the image it is 0."""
+        """Mean of p(M | colour) over a box at each pixel (h, w); outside the image it is 0."""
         assert self._inside is not None
-        # A colour of less than a pixel belongs to neither.
+        # A colour with less than a pixel is counted neither for the person nor the surroundings.
         whole = self._inside + self._around + 1.0 / bins.size
         ratio = (self._inside / whole).astype(np.float32)
         if unseen:
@@ -187,17 +188,17 @@ def binned(image: Image) -> NDArray[np.uint16]:
 
 
 def shares(bins: NDArray[np.uint16]) -> Array:
-    """Share (BINS^3,) of each colour among pixels."""
+    """Share (BINS^3,) of the pixels in each colour bin."""
     counts = np.empty((1, BINS**3), np.int64)
     count_colours(bins, np.zeros(bins.shape, np.uint8), counts)
     return np.asarray(counts[0] / bins.size)
 
 
 def surroundings(model: Mask, outside: Mask) -> Mask:
-    """Pixels (H, W) around those that the model covers, up to half its size away.
+    """Pixels (H, W) around the model, at a distance of up to half its size.
 
     Args:
-        model, outside: pixels of the model, and those beyond it, see `beyond`.
+        model, outside: pixels of the model, and pixels beyond it, see `beyond`.
     """
     x, y, width, height = cv2.boundingRect(model.view(np.uint8))
     margin = max(width, height) // 2
@@ -209,7 +210,7 @@ def surroundings(model: Mask, outside: Mask) -> Mask:
 
 
 def beyond(model: Mask) -> Mask:
-    """Pixels (H, W) that are farther from those of the model than a tenth of its size."""
+    """Pixels (H, W) at a distance from the model of more than a tenth of its size."""
     *_, width, height = cv2.boundingRect(model.view(np.uint8))
     near = max(max(width, height) // 10, 1)
     size = (2 * near + 1, 2 * near + 1)

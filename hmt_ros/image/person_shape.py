@@ -1,4 +1,4 @@
-"""Area of a person in an image, and pieces of a silhouette that may be a person."""
+"""Area of a person in an image, and pieces of a silhouette with the shape of a person."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from hmt_ros.image.background import BackgroundSettings, of_one_person, pieces_o
 from hmt_ros.image.surface_points import coarse_mesh
 from hmt_ros.inference.arrays import Array, Mask
 
-# Approximate height of the raster for areas and colours, px.
+# Approximate height of the coarse raster for areas and colours, px.
 RASTER = 240
-# Minimum length of a person's silhouette, px; minimum area as a fraction of the square of its
-# length (it is no line), and maximum area as a fraction of its bounding box (it is no rectangle).
+# Minimum length of a person's silhouette, px; minimum area as a fraction of the squared length, to
+# exclude lines; maximum area as a fraction of the bounding box, to exclude rectangles.
 LEAST_LENGTH = 40
 LEAST_FILLED, MOST_FILLED = 0.04, 0.9
 
@@ -27,8 +27,8 @@ class Piece(NamedTuple):
     """A piece of a silhouette that has the shape of one person.
 
     Attributes:
-        area: px of the image.
-        cut: whether the left or the right side of the image may cut it.
+        area: number of pixels of the image.
+        cut: whether the piece touches the left or right border of the image, which may cut it.
     """
 
     area: float
@@ -50,12 +50,12 @@ def on_raster(image: NDArray[Any], raster: Mask) -> NDArray[Any]:
 def largest_person(foreground: Mask, step: int = 1) -> Piece | None:
     """The largest piece of a foreground that has the shape of one person; None if missing.
 
-    A piece is connected, or it is the largest one with the pieces near it: clothes in the colours
-    of the room leave gaps.
+    A piece is connected, or is the largest piece together with pieces near it, because clothes in
+    the colours of the room leave gaps.
 
     Args:
-        foreground: (h, w).
-        step: step of its pixels in the image, px.
+        foreground: (h, w) mask.
+        step: step between pixels of the mask in the image, px.
     """
     x, y, across, down = cv2.boundingRect(foreground.view(np.uint8))
     if across == 0:
@@ -92,7 +92,7 @@ def looks_like_person(silhouette: Mask) -> bool:
 def covered(body: Body, camera: Camera, pose: Array, step: int = 1) -> Mask:
     """Every step-th pixel (H / step, W / step) that a body covers at a pose (d,).
 
-    Each part of the flesh counts as the convex hull of its projected points.
+    Each part of the flesh is drawn as the convex hull of its projected points.
     """
     mesh, parts = coarse_mesh(body), len(body.flesh.parts)
     places = point_positions(body.skeleton, pose[None], mesh.segments, mesh.vertices)
@@ -106,23 +106,23 @@ def covered(body: Body, camera: Camera, pose: Array, step: int = 1) -> Mask:
 
 
 def fill_hull(mask: NDArray[np.uint8], pixels: Array) -> None:
-    """Sets the pixels of a mask (H, W) in the convex hull of points (N, 2), px, to 1."""
+    """Sets a mask (H, W) to 1 in the convex hull of points (N, 2), px."""
     cv2.fillConvexPoly(mask, cv2.convexHull(_corners(mask, pixels)), 1)
 
 
 def _corners(mask: NDArray[np.uint8], pixels: Array) -> NDArray[np.int32]:
-    """Integer points (..., 2) for OpenCV, clipped far outside the image so that none overflows."""
+    """Integer points (..., 2) for OpenCV, clipped far outside the image to avoid overflow."""
     limit = 4.0 * max(mask.shape)
     return np.rint(np.clip(pixels, -limit, limit)).astype(np.int32)
 
 
 def counted(mask: Mask) -> int:
-    """Number of the pixels of a mask."""
+    """Number of pixels in a mask."""
     return cv2.countNonZero(mask.view(np.uint8))
 
 
 def resized(area: Mask, margin: float) -> Mask:
-    """An area (H, W) grown by a margin, a fraction of its height; shrunk if that is negative."""
+    """An area (H, W) grown by a fraction of its height, or shrunk if the fraction is negative."""
     pixels = area.view(np.uint8)
     size = max(round(abs(margin) * cv2.boundingRect(pixels)[3]), 1)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))

@@ -1,6 +1,6 @@
-"""Models of the empty scene, pixel by pixel: the contract, and the two models of OpenCV.
+"""Models of the empty scene, pixel by pixel: the interface, and the two models of OpenCV.
 
-A new model is a file beside this one with a class of the contract, and a line in the table
+A new model needs a file in this folder with a class of the interface, and a line in the table
 `BACKGROUNDS` of `background`.
 """
 
@@ -13,19 +13,19 @@ import numpy as np
 
 from hmt_ros.inference.arrays import Image
 
-# Labels of a pixel that differs from the background, and of one that is darker in the same colour;
-# any other is 0.
+# Label of a pixel that differs from the background, and of a darker pixel of the same colour. All
+# other pixels have the label 0.
 FOREGROUND, SHADOW = 255, 127
 
 
 class Background(Protocol):
     """A model of the empty scene that labels the pixels of an image.
 
-    `BACKGROUNDS` makes one that has seen no image, from `threshold` and `shadow_threshold` of
+    `BACKGROUNDS` makes a model without images from `threshold` and `shadow_threshold` of
     `BackgroundSettings`. The same images give the same labels.
 
     Attributes:
-        repeats: number of times that an image is learned when it is the only one.
+        repeats: number of times to learn an image if it is the only image.
         empty: (h, w, 3) the empty scene, as far as it is known.
     """
 
@@ -33,7 +33,7 @@ class Background(Protocol):
 
     @property
     def empty(self) -> Image:
-        """See the attributes."""
+        """See the attributes of the class."""
         ...
 
     def learn(self, image: Image, share: float) -> None:
@@ -50,7 +50,7 @@ class Background(Protocol):
 
 
 class OpenCvBackground:
-    """A background of OpenCV; see `Background`.
+    """A background model of OpenCV; see `Background`.
 
     Args:
         model: a model that has seen no image.
@@ -94,5 +94,5 @@ def mixture_background(threshold: float, shadow_threshold: float) -> Background:
 def neighbour_background(threshold: float, shadow_threshold: float) -> Background:
     """The nearest neighbours among samples of each pixel: KNN."""
     model = cv2.createBackgroundSubtractorKNN(dist2Threshold=20.0 * threshold)
-    # At a learning rate of 0 it would replace its samples at once.
+    # At a learning rate of 0 the model would replace its samples immediately.
     return OpenCvBackground(model, 1e-7, 20, shadow_threshold)

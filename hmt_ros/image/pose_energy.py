@@ -3,9 +3,9 @@
     E(x) = E_image(x) + E_keypoints(x) + E_prior(x) + E_intersection(x) + E_ground(x) + E_flow(x)
            + E_motion(x)
 
-The frames of a pose are computed once, and all terms in `core/terms` read them. The minima are
-those of `inference.bounded_newton`, found problem by problem instead of step by step. A term that
-is not in the core is added by its own `energy`; the minima are then found step by step, too.
+The frames of a pose are computed once, and all terms in `core/terms` read them. The core minimises
+as `inference.bounded_newton` does, but each problem on its own instead of all in common steps. The
+`energy` of a term that is not in the core is added; `bounded_newton` then finds the minima.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Compiled(NamedTuple):
     Attributes:
         placing: constants of the skeleton.
         model, inputs: inputs of the terms of the image.
-        image, contour: whether any of these is on, and whether any that is on needs the contour.
+        image, contour: whether an image term is on, and whether such a term needs the contour.
         keypoints, prior, overlaps, ground, flow: inputs of the other terms.
         centres, precisions: (R, f), (R, f, f) of the motion prior, one row per problem or one for
             all; (0, f), (0, f, f) without a motion prior.
@@ -114,9 +114,9 @@ class ByCue:
     """Energies of n poses by source: image, keypoints, and all other terms.
 
     Attributes:
-        energy: sum of all.
-        values: (n, 3).
-        hessians: (n, 3, d, d); (0, 3, d, d) if they were not requested.
+        energy: sum over the sources.
+        values: (n, 3) energy of each source.
+        hessians: (n, 3, d, d) of each source; (0, 3, d, d) if they were not requested.
         outline_costs: (n, M) energy of each sample of the silhouette's outline.
     """
 
@@ -133,7 +133,7 @@ class PoseEnergy:
     Attributes:
         likelihood: image likelihood of the body.
         terms: terms that read the frames of a pose, at most one of each kind that has a kernel.
-        motion: prior around the expected poses, over the free variables; None if missing.
+        motion: motion prior of the free variables, around the expected poses; None if missing.
         point: (d,) values of all variables; None: all are free.
         free: (f,) indices of the variables that may move, if `point` is given.
         counted: called with the number of poses that were evaluated; None: not called.
@@ -141,7 +141,7 @@ class PoseEnergy:
         _strange: terms without a compiled kernel.
 
     Raises:
-        ValueError: two terms are of one kind that has a kernel.
+        ValueError: two terms with a kernel are of the same kind.
     """
 
     likelihood: ImageLikelihood
@@ -224,8 +224,8 @@ class PoseEnergy:
         """Minima from starts x (n, f) within the limits of the body; see `bounded_newton.minimise`.
 
         Args:
-            x: starts.
-            step_scale: (d,) or a scalar; None: that of the body.
+            x: (n, f) initial values of the free variables.
+            step_scale: (d,) or scalar length of a moderate step; None: `scale_of` the body.
             damping, max_iterations, tolerance: as for `bounded_newton.minimise`.
 
         Raises:
@@ -267,14 +267,14 @@ class PoseEnergy:
     ) -> tuple[
         Energy, tuple[Array, Array, Array], NDArray[np.int8], NDArray[np.int32], NDArray[np.bool_]
     ]:
-        """Energies at points x (n, f), or minima that x is moved to; results as for `solve`.
+        """Energies at points x (n, f), or minima, which are written to x; results as for `solve`.
 
         Args:
             rows: (n,) problem of each point; None: point i belongs to problem i.
             descent: settings of the minimiser; with `NO_DESCENT` the points stay.
-            together: number of points that a thread takes at once.
+            together: number of points in a block of work for a thread.
             wanted: whether derivatives are wanted.
-            apart: whether values and Hessians by cue, and costs of the outline, are wanted.
+            apart: whether values and Hessians of each cue, and outline costs, are wanted.
         """
         n, f = x.shape
         asked, values = n if wanted else 0, n if apart else 0
@@ -329,7 +329,7 @@ class PoseEnergy:
 
     @cached_property
     def _compiled(self) -> Compiled:
-        """The terms as compiled code reads them, without room for costs of the outline."""
+        """The terms as compiled code reads them, without a buffer for outline costs."""
         known = self._own
         if self.motion is not None:
             centres, precisions, tails = _expected(self.motion)
@@ -346,7 +346,7 @@ def _summed(likelihood: ImageLikelihood, terms: tuple[CompiledTerm | FrameTerm, 
     """Terms with a compiled kernel, as compiled code reads them.
 
     Raises:
-        ValueError: two terms are of one kind.
+        ValueError: two terms are of the same kind.
     """
     known: dict[str, Any] = {}
     for term in terms:
@@ -361,7 +361,7 @@ def _summed(likelihood: ImageLikelihood, terms: tuple[CompiledTerm | FrameTerm, 
 
 
 def _with_costs(compiled: Compiled, poses: int) -> tuple[Compiled, Array]:
-    """The terms with room for the energies (N, M) of the samples of an outline, and that room."""
+    """The terms with a buffer for the energies (N, M) of outline samples, and this buffer."""
     inputs, costs = list(compiled.inputs), np.zeros((poses, 0))
     for i, own in enumerate(inputs):
         if hasattr(own, 'costs'):
@@ -415,7 +415,7 @@ def _every_variable(body: Body) -> Index:
 
 @lru_cache(maxsize=16)
 def _absent(body: Body) -> Compiled:
-    """Inputs of compiled code without any term."""
+    """Inputs of compiled code if all terms are absent."""
     camera = Camera(1.0, 1.0, 0.0, 0.0, 1, 1)
     none, nothing = np.zeros(0, np.int64), np.zeros((0, 0, 3))
     no_keypoints = Keypoints((), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))

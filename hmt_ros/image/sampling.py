@@ -1,4 +1,4 @@
-"""Image maps, which `core/sampling.h` samples for bilinear values and gradients."""
+"""Image maps, from which `core/sampling.h` interpolates bilinear values and gradients."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 class ImageMap(NamedTuple):
-    """Values on a window of the pixel grid, of one or several channels.
+    """Values in one or several channels on a window of the pixel grid.
 
     Attributes:
         values: (C, h, w) float32, h and w at least 2.

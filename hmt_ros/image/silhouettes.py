@@ -1,14 +1,14 @@
-"""Source of the silhouette of an image, and whether the background is to be trusted.
+"""Source of the silhouette of an image, and check of the background.
 
-The mask of a segmenter is used if there is one; otherwise the background is subtracted, once the
+The mask of a segmenter is used if available. Otherwise the background is subtracted, as soon as the
 scene is known to be empty (`EmptyScene`). When a track starts from joints, the pose is known, and
 
     f = |foreground and area of the body| / |area of the body|
 
-is near 1 in front of an empty scene, and less in clothes of the colours of the room. Below
-`MIN_FOREGROUND_FRACTION` a learned background is forgotten and rebuilt, pixel by pixel, from later
-images: where no mode of the posterior has the person, as far as other cues than silhouettes locate
-the person. Until it is known around the person, images are tracked without silhouettes.
+is near 1 if the background is the empty scene, and less for clothes in the colours of the room.
+Below `MIN_FOREGROUND_FRACTION` a learned background is forgotten. It is rebuilt from pixels of
+later images that no mode of the posterior covers with the person; cues other than silhouettes
+locate the person. Until the background around the person is known, tracking uses no silhouettes.
 """
 
 from __future__ import annotations
@@ -31,28 +31,28 @@ from hmt_ros.inference.arrays import Array, Image, Mask
 VIEW_SHIFT = 2.0
 # Minimum foreground fraction of the person for the background to count as empty.
 MIN_FOREGROUND_FRACTION = 0.35
-# Log odds that somebody is in a scene that was rebuilt where nobody was, nats.
+# Log odds of a person in a background that was rebuilt without people, nats.
 COMPLETED_LOG_ODDS = -6.0
-# Margins of the area of a body, as a fraction of its height: inwards for the certain area of the
-# person, outwards for the possible one.
+# Margins of the area of a body, as a fraction of its height: inwards for pixels that certainly show
+# the person, outwards for pixels that possibly do.
 INNER_MARGIN, OUTER_MARGIN = 0.01, 0.06
 # Maximum unknown fraction of the person's area for silhouettes to be used.
 MAX_UNKNOWN_FRACTION = 0.02
-# Margin around all joints of all modes that a silhouette may reach, as a fraction of their extent.
+# Margin of a silhouette around all joints of all modes, as a fraction of the joints' extent.
 REGION_MARGIN = 0.3
 
 
 class Silhouettes:
-    """The silhouettes of one person before one camera.
+    """The silhouettes of one person in the images of one camera.
 
     Args:
-        background: the empty scene, or a model that is to learn it.
-        shared: whether other people share the background; it is then learned elsewhere.
+        background: background model, of the empty scene or without any image so far.
+        shared: whether other people share the background, which is then learned elsewhere.
 
     Attributes:
         scene: the empty scene, as far as it is known.
         watch: detects whether the camera has moved since the background was taken.
-        doubted: whether the background was learned with the person in it, and is not yet rebuilt.
+        doubted: whether the background shows the person and has not been rebuilt yet.
     """
 
     def __init__(self, background: BackgroundModel, *, shared: bool = False) -> None:
@@ -79,13 +79,13 @@ class Silhouettes:
         return 'not yet seen empty' if self.background.frames else 'unknown'
 
     def forget(self) -> None:
-        """Starts again without a background, because the camera sees another scene."""
+        """Restarts without a background, because the camera sees another scene."""
         self.scene = EmptyScene(BackgroundModel(self.background.settings), trusted=self._shared)
         self.doubted, self._learning = False, not self._shared
         self.watch = SceneWatch()
 
     def see_from(self, pose: CameraPose, camera: Camera) -> None:
-        """Sets the pose of the camera at an image; another view forgets the background."""
+        """Sets the pose of the camera; if the view has changed, the background is forgotten."""
         if self._seen_from is None:
             self._seen_from = pose
         elif pose.shift(self._seen_from, camera) > VIEW_SHIFT:
@@ -93,7 +93,7 @@ class Silhouettes:
             self._seen_from = pose
 
     def learn(self, image: Image, stamp: int, detected: bool | None = None) -> None:
-        """Learns the scene from an image before the track; see `EmptyScene.learn`."""
+        """Learns the scene from an image before a track starts; see `EmptyScene.learn`."""
         if self._learning:
             if self.doubted:
                 self.forget()
@@ -111,9 +111,9 @@ class Silhouettes:
 
         Args:
             image: (H, W, 3).
-            stamp: of the image, ns.
-            mask: (H, W) of a segmenter, if any.
-            region: where the person can be; None: anywhere.
+            stamp: stamp of the image, ns.
+            mask: (H, W) mask from a segmenter, if any.
+            region: box that can contain the person; None: the whole image.
             others: (H, W) pixels that somebody else covers; None if missing.
         """
         if mask is not None:
@@ -134,7 +134,7 @@ class Silhouettes:
 
         Args:
             image, mask, others: as for `silhouette`, whose result must not be None.
-            step: px.
+            step: step between pixels, px.
         """
         found = self.background.foreground(image) if mask is None else mask
         coarse = found[::step, ::step]
@@ -145,9 +145,9 @@ class Silhouettes:
         return np.asarray(cv2.medianBlur(pixels, 3), dtype=np.uint8).view(np.bool_)
 
     def check(self, image: Image, body: Body, camera: Camera, poses: Array) -> None:
-        """Doubts the background if too little of the person, in poses (K, d), is foreground.
+        """Forgets a background in which too little of the person, in poses (K, d), is foreground.
 
-        A background that was given, not learned, is the empty scene and never doubted.
+        A background that was given instead of learned is trusted to be the empty scene.
         """
         if not self.background.frames or not self._learning:
             return
@@ -163,7 +163,7 @@ class Silhouettes:
         self.background.forget()
 
     def complete(self, image: Image, body: Body, camera: Camera, poses: Array) -> None:
-        """Rebuilds a forgotten background where the person in poses (K, d) is not."""
+        """Rebuilds a forgotten background from pixels outside the person in poses (K, d)."""
         if self.background.unknown is None:
             return
         area = _area(body, camera, poses)
@@ -180,10 +180,10 @@ class Silhouettes:
 def region_of(
     body: Body, camera: Camera, poses: Array, margin: float = REGION_MARGIN, dt: float = 0.0
 ) -> Box | None:
-    """Where a person in poses (K, d) can be in the next image; None if anywhere.
+    """Box that can contain a person in poses (K, d) in the next image; None if anywhere.
 
     Args:
-        body, camera, poses: of the person.
+        body, camera, poses: body and poses of the person, and the camera.
         margin: margin around all joints, as a fraction of their extent.
         dt: time since the person was at the poses, s.
     """

@@ -1,7 +1,7 @@
-"""Whether two images show the same picture around keypoints.
+"""Detects that images do not change around keypoints, which are then not those of a person.
 
 A detector that takes the foot of a table for a person does so in every image of the same scene.
-People move, if only a little.
+People always move a little.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Image
 
 # Blur of compared images, px; minimum change of a pixel that is not noise, grey levels; minimum
-# fraction of the pixels around keypoints that change when a person breathes or sways within tenths
-# of a second (0.003 and more on ten clips of people, 0 on a table); minimum contrast, grey levels.
+# fraction of changed pixels around keypoints, because a person breathes or sways within tenths of a
+# second (at least 0.003 on ten clips of people, 0 on a table); minimum contrast, grey levels.
 BLUR, CHANGED, MOVING, CONTRAST = 1.5, 10.0, 0.002, 4.0
 
 
 class StillPicture:
-    """The last image that differed around keypoints from the image kept before it."""
+    """Keeps the last image that had changed around the keypoints."""
 
     def __init__(self) -> None:
         self._last: NDArray[np.float32] | None = None
 
     def shows_again(self, image: Image, keypoints: Keypoints) -> bool:
-        """Whether an image equals the kept one around keypoints; if not, it is kept instead.
+        """Whether an image equals the kept one around keypoints; if not, keeps the new image.
 
         Args:
             image: (H, W, 3) BGR.
-            keypoints: keypoints, at least one of which was seen.
+            keypoints: keypoints, of which at least one was seen.
         """
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         picture = cv2.GaussianBlur(grey, (0, 0), BLUR).astype(np.float32)

@@ -19,7 +19,7 @@ KEYS = ('stamp_ns', 'sigma_px', 'keypoints', 'segment_lengths_m', 'stature_m')
 
 
 class SubjectError(ValueError):
-    """A subject file cannot be used; the message, one line, gives the content seen and wanted."""
+    """A subject file cannot be used; the message, of one line, gives seen and wanted content."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Subject:
     """The content of a subject file, from which a track starts.
 
     Attributes:
-        stamp_ns: stamp of the image in which the joints were seen.
-        keypoints: the joints.
+        stamp_ns: stamp of the image in which the joints were seen, ns.
+        keypoints: the joints as keypoints.
         segment_lengths: measured lengths by name, m.
         stature: stature, m; None if unknown.
     """
@@ -108,7 +108,7 @@ def _positive(value: Any, name: str, largest: float = LARGEST_PIXEL) -> float:
 
 
 def _length(value: Any, name: str, signed: bool) -> float:
-    """A length, m; a signed one, such as an offset, may be negative."""
+    """Checks a length, m; a signed length, such as an offset, can be negative."""
     if not signed:
         return _positive(value, f'length {name}', LONGEST)
     if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LONGEST:

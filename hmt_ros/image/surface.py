@@ -1,8 +1,7 @@
 """The occluding contour in the image, and its visible points, as the compiled core reads them.
 
-`core/surface.h` traces it pose by pose, the counterpart of the contours of `body.flesh` and
-`Camera.project`: on every ring of the flesh the two points whose normal is perpendicular to the
-ray.
+`core/surface.h` traces the contour pose by pose, as `body.flesh` and `Camera.project` do: on every
+ring of the flesh it consists of the two points whose normal is perpendicular to the viewing ray.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ Ints = NDArray[np.int64]
 class FleshTable(NamedTuple):
     """The flesh as the compiled code reads it: parts (B,), and rings (R,) of `flesh.Rings`.
 
-    `ring_noise` (R, 2) are standard deviations of contours of people from the model's, at the
-    sides and in front or behind, m; see `contour_noise.yaml`.
+    `ring_noise` (R, 2) is the standard deviation between contours of people and of the model, at
+    the sides and in front or behind, m; see `contour_noise.yaml`.
     """
 
     part_segments: Ints
@@ -44,15 +43,15 @@ class Contour(NamedTuple):
     """Contour of one pose, P = 2R points.
 
     Attributes:
-        parts: (P,).
+        parts: (P,) part of the flesh of each point.
         points: (P, 3) camera frame, m.
-        pixels: (P, 2).
+        pixels: (P, 2) projections of the points.
         projections: (P, 2, 3) derivative of the pixels with respect to the points.
-        normals: (P, 2) out of the body, in the image.
-        valid: (P,) the point exists and lies in front of the camera.
-        covered: (P,) another part lies on the same ray, in front or behind.
-        hidden: (P,) another part lies on the same ray, in front.
-        noise: (P,) standard deviation of contours of people from the point, m.
+        normals: (P, 2) outward normals in the image.
+        valid: (P,) whether the point exists and lies in front of the camera.
+        covered: (P,) whether another part lies on the same ray, in front or behind.
+        hidden: (P,) whether another part lies on the same ray, in front.
+        noise: (P,) standard deviation between contours of people and the point, m.
     """
 
     parts: Ints
@@ -92,14 +91,14 @@ def _noise_of_parts() -> dict[str, list[float]]:
 
 
 def _contour_noise(body: Body) -> Array:
-    """Standard deviations (B, 2) of contours at the sides of each part, and in front, m."""
+    """Standard deviations (B, 2) of contours at the sides and in front of each part, m."""
     known, names = _noise_of_parts(), body.skeleton.segment_names
     plain = [names[p.segment].removeprefix('left_').removeprefix('right_') for p in body.shapes]
     return np.array([known.get(name, known['other']) for name in plain]).reshape(-1, 2)
 
 
 def empty_contour(rings: int) -> Contour:
-    """A contour with room for one pose."""
+    """An empty buffer for the contour of one pose."""
     count = 2 * rings
     valid, covered, hidden = np.zeros((3, count), np.bool_)
     return Contour(

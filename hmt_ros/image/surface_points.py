@@ -22,10 +22,10 @@ class SurfacePoints(NamedTuple):
     """Up to Q points on the visible surface of each of K poses.
 
     Attributes:
-        counts: (K,) number of points of each pose; the rest of its row is not used.
-        segments: (K, Q) segments that the points lie on.
-        local: (K, Q, 3) positions in the frames of the segments, m.
-        pixels: (K, Q, 2) where they are seen.
+        counts: (K,) number of points of each pose; further entries of its row are not used.
+        segments: (K, Q) segments on which the points lie.
+        local: (K, Q, 3) positions of the points in the frames of the segments, m.
+        pixels: (K, Q, 2) projections of the points, px.
     """
 
     counts: Ints
@@ -39,13 +39,13 @@ def seen_points(
 ) -> SurfacePoints:
     """Points of the surface visible at K poses.
 
-    They are spread evenly over the visible vertices of a coarse mesh, the same way every time.
+    They are spread evenly over the visible vertices of a coarse mesh, without random choice.
 
     Args:
-        body: with flesh.
-        camera: camera that sees it.
+        body: body with flesh.
+        camera: camera that sees the body.
         frames: frames of the K poses.
-        others: (H, W) pixels that show or may show somebody else; None if missing.
+        others: (H, W) pixels that show or possibly show other people; None if missing.
         points: maximum number Q of points per pose.
     """
     k = frames.count
@@ -68,5 +68,5 @@ def seen_points(
 
 
 def coarse_mesh(body: Body) -> Mesh:
-    """The coarse mesh whose vertices are candidate points."""
+    """The coarse mesh of a body, whose vertices are candidate points."""
     return body.flesh.mesh(stacks=5, slices=10)

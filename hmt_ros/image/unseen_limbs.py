@@ -1,12 +1,13 @@
-"""Which limbs an image shows, and how long ago the others were last shown.
+"""Which limbs an image shows, and how long ago the other limbs were last visible.
 
-A limb is shown as far out as keypoints find its joints in the image. Without keypoints it is shown
-wherever it lies in the image, because silhouette, edges and flow may show it.
+A limb counts as visible up to the outermost joint that keypoints find in the image. Without
+keypoints, every part of a limb inside the image counts as visible, because silhouette, edges and
+flow can show it.
 
-A leg is hidden, by furniture or by the border of the image, if a detector is sure of none of its
-joints beyond the hip. The detector then guesses from usual poses of legs, and a missing silhouette
-of the leg is no evidence either. An arm that a detector is not sure of is
-mostly behind its own trunk, where guesses are good.
+A leg is hidden, by furniture or by the border of the image, if a detector has no confident keypoint
+of its joints beyond the hip. The detector then guesses from usual poses of legs, and a missing
+silhouette of the leg is no evidence either. If a detector is not confident of an arm, the arm is
+mostly behind the person's own trunk, where guesses are good.
 """
 
 from __future__ import annotations
@@ -27,22 +28,22 @@ from hmt_ros.inference.error_model import seconds
 
 # Confidence below which a keypoint is a guess.
 GUESSED = 0.02
-# Confidence above which a detector more likely than not sees a keypoint.
+# Confidence above which a keypoint is more likely seen than guessed.
 SEEN = 0.5
-# Time for which a limb counts as shown, or as hidden, after the last image with this evidence, s.
+# Time after the last evidence for which a limb still counts as visible, or as hidden, s.
 SHORT = 1.0
-# Error of an unseen joint for each bone of its limb, as a fraction of the bone's length: lengths of
-# people vary, and a linear map is inexact within a posture.
+# Error of an unseen joint per bone of its limb, as a fraction of the bone's length, because lengths
+# of people vary and a linear map is inexact within a posture.
 ALONG_LIMB = 0.08
 
 
 class UnseenLimbs:
-    """Times since an image last showed the segments of a person's limbs.
+    """Times since the segments of a person's limbs were last visible.
 
     Attributes:
-        times: (S,) s; 0 if the last image shows the joint at the start of the segment or one
-            further out, or if the segment is not in a limb; inf if no image has shown it.
-        hidden: (S,) segments that something hides from the detector; None if nothing does.
+        times: (S,) time since each segment was visible, s; 0 if the last image shows the joint at
+            its start or one further out, or if it is not in a limb; inf if it was never visible.
+        hidden: (S,) segments that something hides from the detector; None if none is hidden.
     """
 
     def __init__(self, body: Body) -> None:
@@ -57,9 +58,9 @@ class UnseenLimbs:
 
         Args:
             body: body of the person.
-            keypoints: keypoints of an image; None if the detector has not answered: segments that
-                were hidden within `SHORT` then stay hidden.
-            stamp: of the image, ns.
+            keypoints: keypoints of an image; None if the detector gave no result. Then hidden
+                segments stay hidden for up to `SHORT` after its last result.
+            stamp: stamp of the image, ns.
         """
         if keypoints is None:
             if seconds(stamp - self._answered) > SHORT:
@@ -77,16 +78,16 @@ class UnseenLimbs:
     def look(
         self, body: Body, camera: Camera, observation: Observation, pose: Array, dt: float
     ) -> None:
-        """Updates the times by an image and the likeliest pose (d,) in it.
+        """Updates the times with an image and its likeliest pose (d,).
 
         Args:
-            dt: time since the image before, s; inf for the first image.
+            dt: time since the previous image, s; inf for the first image.
         """
         shown = shown_segments(body, camera, observation, pose)
         self.times = np.where(shown, 0.0, self.times + dt)
 
     def of_dofs(self, body: Body) -> Array:
-        """Time (d,) since each degree of freedom was shown, by the joint beyond it, s."""
+        """Time (d,) since the joint beyond each degree of freedom was visible, s."""
         beyond = np.arange(len(self.times))
         for chain in body.chains.values():
             beyond[list(chain[:-1])] = chain[1:]
@@ -95,11 +96,11 @@ class UnseenLimbs:
         return times[body.skeleton.dof_segments]
 
     def shown_joints(self, body: Body) -> Mask:
-        """Joints (J,) that an image has shown within `SHORT`."""
+        """Joints (J,) that were visible within the time `SHORT`."""
         return np.asarray(self.times[body.skeleton.joint_segments] < SHORT)
 
     def told(self, body: Body) -> Body:
-        """The body with larger errors of unseen joints, whose bones vary and which move on arcs."""
+        """The body with larger errors of unseen joints, for unknown lengths and motion on arcs."""
         hidden = self.times > 0.0
         return _told(body, tuple(hidden.tolist())) if hidden.any() else body
 
@@ -115,7 +116,7 @@ def _told(body: Body, hidden: tuple[bool, ...]) -> Body:
 
 
 def hidden_segments(skeleton: Skeleton, keypoints: Keypoints) -> Mask:
-    """Segments (S,) of legs, below the knee, that something hides from a detector."""
+    """Segments (S,) of legs beyond the thigh that something hides from a detector."""
     hidden = np.zeros(len(skeleton.parents), dtype=np.bool_)
     segments = skeleton.joint_segments[skeleton.joint_index(keypoints.names)]
     sure = keypoints.seen & (keypoints.confidences >= SEEN)
@@ -127,7 +128,7 @@ def hidden_segments(skeleton: Skeleton, keypoints: Keypoints) -> Mask:
 
 
 def shown_segments(body: Body, camera: Camera, observation: Observation, pose: Array) -> Mask:
-    """Segments (S,) that an image shows at a pose (d,), see `UnseenLimbs.times`."""
+    """Segments (S,) that are visible in an image at a pose (d,), see `UnseenLimbs.times`."""
     skeleton, keypoints = body.skeleton, observation.keypoints
     if keypoints is None:
         origins = forward(skeleton, pose[None]).segments[1][0]
@@ -143,13 +144,13 @@ def shown_segments(body: Body, camera: Camera, observation: Observation, pose: A
 
 @lru_cache(maxsize=16)
 def _showing(skeleton: Skeleton) -> Mask:
-    """Segments (S, S) that show the segment of each row; without any it always counts as shown."""
+    """Segments (S, S) that make each row's segment visible; an empty row is always visible."""
     result = np.zeros((len(skeleton.parents),) * 2, dtype=np.bool_)
     for chain in (chain for pair in sided_pairs(skeleton.chains) for chain in pair):
         outwards = list(skeleton.chains[chain])
         for place, segment in enumerate(outwards):
             result[segment, outwards[place:]] = True
-    # The pelvis is shown by a leg.
+    # A visible leg makes the pelvis visible.
     hung = [own[0] for own in skeleton.chains.values() if skeleton.parents[own[0]] == 0]
     if result[hung].any(1).all():
         result[0] = result[hung].any(0)

@@ -7,9 +7,9 @@ such a frame R, projected at the place of the line,
     log p(lines | R) = sum_i log[1 - s + s / 3 sum_k r(e_ik)],   r(e) = N(e; 0, sigma) / uniform,
 
 where a share s of all lines follows the frame and the rest is clutter. Summed over a raster of
-frames with a prior over how cameras are mounted, this gives the probability that there is such a
-frame at all, and the direction of its vertical. Furniture has any horizontal direction, so only the
-lines that agree with the vertical refine it, from a wide sigma to a narrow one.
+frames with a prior over the orientations of mounted cameras, this gives the probability that such a
+frame exists, and the direction of its vertical. Furniture has any horizontal direction, so only the
+lines that agree with the vertical refine it, with a sigma that decreases from round to round.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from hmt_ros.inference.arrays import Array, Image, Index
 from hmt_ros.inference.linear_algebra import inverse, length, log_sum_exp, product, solve
 from hmt_ros.inference.logistic import probability_of
 
-# The level of an upright camera.
+# Rotation `level` of an upright camera.
 UPRIGHT = np.eye(3)
 # Maximum side of an image, px (larger ones are reduced), and minimum length of a line, rad.
 LARGEST, SHORTEST = 800, 0.03
-# Angle between the planes of two lines through the camera below which they are one line, rad.
+# Angle below which two lines are one line, between their planes through the camera, rad.
 SAME_LINE = np.radians(0.7)
 # Share of lines that follow the frame; standard deviation of an end of a line, px.
 SHARE, END_SIGMA = 0.5, 0.5
-# How cameras are mounted, rad: mean pitch, down is positive, and its deviations upwards and
-# downwards; limits of pitch; deviation of roll, and its limit.
+# Prior over orientations of cameras, rad: mean pitch (positive downwards), its standard deviations
+# upwards and downwards, and its limits; standard deviation of roll, and its limit.
 PITCH, PITCH_SIGMA = np.radians(5.0), (np.radians(12.0), np.radians(20.0))
 PITCHES = np.radians(-40.0), np.radians(72.0)
 ROLL, MOST_ROLL = np.radians(6.0), np.radians(32.0)
@@ -44,12 +44,12 @@ ROLL, MOST_ROLL = np.radians(6.0), np.radians(32.0)
 # each round of the refinement, rad.
 STEP, COARSE = np.radians(4.0), np.radians(2.5)
 FINER = tuple(np.radians([4.0, 3.0, 2.0, 1.0, 0.5, 0.5, 0.5]))
-# Standard deviation of the vertical of the best frame on the raster, and minimum one after the
-# refinement, because walls lean and lenses bend lines, rad.
+# Standard deviation of the vertical of the best frame on the raster, and minimum standard deviation
+# after the refinement, because walls lean and lenses bend lines, rad.
 RASTER_SIGMA, LEAST_SIGMA = np.radians(4.0), np.radians(1.0)
-# Probability that a seen vertical is right, and density of a wrong one, 1/sr.
+# Probability that a detected vertical is right, and density of a wrong vertical, 1/sr.
 RIGHT, ANYWHERE = 0.9, 1.0 / (2.0 * np.pi)
-# Minimum probability that there is a frame whose vertical is near the best one, and radius of that
+# Minimum probability that a frame exists with its vertical near the best one, and radius of this
 # neighbourhood, rad.
 BELIEVED, SURROUNDINGS = 0.95, np.radians(10.0)
 
@@ -59,8 +59,8 @@ class Lines(NamedTuple):
 
     Attributes:
         normals: (N, 3) unit normals of the planes through the camera and the lines, camera frame.
-        middles: (N, 3) unit rays to their middles.
-        errors: (N,) standard deviations of their directions in the image, rad.
+        middles: (N, 3) unit rays to the middles of the lines, camera frame.
+        errors: (N,) standard deviations of the directions of the lines in the image, rad.
     """
 
     normals: Array
@@ -74,23 +74,23 @@ class Vertical:
 
     Attributes:
         up: (3,) unit vector against gravity, camera frame.
-        sigma: standard deviation of its angle about each horizontal axis, rad.
+        sigma: standard deviation of the angle of `up` about each horizontal axis, rad.
     """
 
     up: Array
     sigma: float
 
     def agreement(self, up: Array, sigma: float) -> float:
-        """Density of this vertical if another one (3,) with a deviation is right, over uniform."""
+        """Ratio of the density given another vertical `up` (3,) to a uniform density."""
         variance = sigma**2 + self.sigma**2
         square = 2.0 - 2.0 * float(product(up, self.up))
         near = elementary.exp(-0.5 * square / variance) / (2.0 * np.pi * variance)
         return float(RIGHT * near / ANYWHERE + 1.0 - RIGHT)
 
     def refined(self, up: Array, sigma: float) -> Vertical:
-        """Another vertical, (3,) with a deviation, refined by this one as far as both agree.
+        """Another vertical `up` (3,), refined by this one as far as both agree.
 
-        It moves by at most its deviation.
+        The other vertical moves by at most its standard deviation `sigma`.
         """
         right = 1.0 - (1.0 - RIGHT) / self.agreement(up, sigma)
         share = max(right, 0.0) * sigma**2 / (sigma**2 + self.sigma**2)
@@ -100,11 +100,11 @@ class Vertical:
 
 
 def seen_vertical(image: Image, camera: Camera, level: Array = UPRIGHT) -> Vertical | None:
-    """The vertical that an image (H, W) or (H, W, 3) shows; None if its lines show none.
+    """The vertical from the lines of an image (H, W) or (H, W, 3); None if they show no vertical.
 
     Args:
         image: image of the camera.
-        camera: a camera that is mounted as usual, except for its level.
+        camera: a camera in a usual orientation, except for the rotation `level`.
         level: (3, 3) rotation about the optical axis from an upright camera's axes to its own.
     """
     lines = straight_lines(image, camera)
@@ -144,7 +144,7 @@ def straight_lines(image: Image, camera: Camera) -> Lines:
 
 
 def vertical_of(lines: Lines) -> Vertical | None:
-    """The vertical of lines; None if they are clutter or fit several verticals."""
+    """The vertical from lines; None if they are clutter or fit several verticals."""
     raster = _raster()
     ratios = _ratios(raster.directions, lines, COARSE)
     value = np.empty(raster.first.shape)
@@ -158,7 +158,7 @@ def vertical_of(lines: Lines) -> Vertical | None:
 
 
 def _refined(start: Array, lines: Lines) -> Vertical:
-    """The vertical from the lines that agree with it, near a start (3,) from the raster."""
+    """The vertical from the lines that agree with it; `start` (3,) is from the raster."""
     up = start
     information = np.eye(3)
     for sigma in FINER:
@@ -179,7 +179,7 @@ def _refined(start: Array, lines: Lines) -> Vertical:
 
 
 def _ratios(directions: Array, lines: Lines, sigma: float) -> Array:
-    """Densities (D, N) of the angles of lines that run along directions (D, 3), over uniform."""
+    """Ratios (D, N) to a uniform density, of N lines if they run along directions (D, 3)."""
     deviations = np.sqrt(sigma**2 + lines.errors**2)
     result = np.empty((len(directions), len(deviations)))
     rate_lines(directions, lines.normals, lines.middles, deviations, result)
@@ -187,7 +187,7 @@ def _ratios(directions: Array, lines: Lines, sigma: float) -> Array:
 
 
 def _distinct(normals: Array) -> Index:
-    """Indices of unit normals (N, 3) that differ from all that were kept before them."""
+    """Indices of unit normals (N, 3) that differ from all normals kept before."""
     same = np.abs(product(normals, normals.T)) > elementary.cos(SAME_LINE)
     free = np.ones(len(normals), dtype=np.bool_)
     kept = []
@@ -203,10 +203,10 @@ class _Raster(NamedTuple):
 
     Attributes:
         ups: (F, 3) verticals.
-        log_prior: (F,) of the verticals.
-        directions: (D, 3) all directions of the frames, rounded, up to their sign.
-        vertical: (F,) index of the vertical of a frame in `directions`.
-        first, second: (F, A) indices of its horizontal directions.
+        log_prior: (F,) log prior probabilities of the verticals.
+        directions: (D, 3) all distinct directions of the frames, rounded, without sign.
+        vertical: (F,) index of each vertical in `directions`.
+        first, second: (F, A) indices of the horizontal directions in `directions`.
     """
 
     ups: Array
@@ -248,7 +248,7 @@ def _raster() -> _Raster:
     cosine, sine = elementary.cos(turns)[None, :, None], elementary.sin(turns)[None, :, None]
     first = cosine * across[:, None] + sine * ahead[:, None]
     second = cosine * ahead[:, None] - sine * across[:, None]
-    # Directions are rounded to a half of the step.
+    # Directions are rounded to half a step.
     every = np.concatenate([ups, first.reshape(-1, 3), second.reshape(-1, 3)])
     every = every * np.where(every[:, 2:] < 0.0, -1.0, 1.0)
     cells = np.round(every / (0.5 * STEP)).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Mathematics without bodies or images: energies, mixtures, bounded second-order minimisation."""
+"""Mathematics independent of bodies and images: energies, mixtures, bounded minimisation."""
 
 from hmt_ros.inference.bounded_newton import Minimum, Status, minimise
 from hmt_ros.inference.mixture import GaussianMixture

@@ -1,4 +1,4 @@
-"""Names of the array types that the package passes around."""
+"""Names of the array types of the package."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,15 +1,15 @@
 """Symmetric block-tridiagonal matrices: Cholesky factors, solutions, blocks of the inverse.
 
 The precision of a trajectory X = (x_1 .. x_T) of a Markov process has this form (VMS 5):
-observations fill the diagonal blocks, the dynamics couple neighbours,
+observations add to the diagonal blocks, and the dynamics couple neighbours,
 
     P = | D_1  E_1'          |        P = L L',  L lower triangular with the same blocks.
         | E_1  D_2  E_2'     |
         |      E_2  D_3  ... |
 
-Elimination forwards is filtering, substitution backwards is smoothing. The cost is O(T n^3) and
-there is never a dense (T n, T n) array: the matrix is kept in LAPACK's band storage, whose width
-follows from the coupling; where E_t is diagonal it is half of that for full blocks.
+Forward elimination is filtering, backward substitution is smoothing. The cost is O(T n^3), without
+a dense (T n, T n) array: the matrix is in LAPACK's band storage, whose width depends on the
+coupling blocks E_t; with diagonal E_t it is half of the width with full blocks.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from hmt_ros.inference.linear_algebra import product
 
 
 class NotPositiveDefiniteError(ValueError):
-    """A matrix that was to be factorised is not positive definite."""
+    """Raised when a matrix to factorise is not positive definite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +45,8 @@ class BlockTridiagonal:
     """A symmetric matrix of T x T blocks of n x n.
 
     Attributes:
-        diagonal: (T, n, n) D_t; only the lower triangles are read.
-        lower: (T-1, n, n) E_t, the block below D_t.
+        diagonal: (T, n, n) diagonal blocks D_t; only the lower triangles are read.
+        lower: (T-1, n, n) blocks E_t below D_t.
 
     Raises:
         ValueError: shapes are inconsistent.
@@ -65,18 +65,18 @@ class BlockTridiagonal:
 
     @cached_property
     def bandwidth(self) -> int:
-        """Number of diagonals below the main one that are not zero."""
+        """Number of diagonals in the band below the main diagonal."""
         return bandwidth(self.lower, self.diagonal.shape[1])
 
     def product(self, x: Array) -> Array:
-        """P x of trajectories x (..., T, n)."""
+        """Product P x with trajectories x (..., T, n)."""
         flat = np.ascontiguousarray(x.reshape(-1, self.diagonal.shape[0] * self.diagonal.shape[1]))
         result = np.zeros_like(flat)
         add_band_product(self.band(), flat, result)
         return result.reshape(x.shape)
 
     def cholesky(self) -> BlockCholesky:
-        """The factor L.
+        """Computes the Cholesky factor L.
 
         Raises:
             NotPositiveDefiniteError: the matrix is not positive definite.
@@ -85,7 +85,7 @@ class BlockTridiagonal:
         return factorise(self.band(), t, n)
 
     def band(self) -> Array:
-        """The columns (T n, width + 1) of LAPACK's band storage: [j, i - j] = P[i, j]."""
+        """Columns (T n, width + 1) of P in LAPACK's band storage: [j, i - j] = P[i, j]."""
         t, n = self.diagonal.shape[:2]
         columns = np.zeros((t * n, self.bandwidth + 1))
         add_diagonal(columns, np.ascontiguousarray(self.diagonal.swapaxes(1, 2)), n)
@@ -99,9 +99,9 @@ class BlockCholesky:
 
     Attributes:
         columns: (T n, width + 1) of L in LAPACK's band storage: [j, i - j] = L[i, j].
-        times, size: T and n.
-        last_first: whether the blocks are eliminated from the last to the first. Blocks of the
-            inverse are then computed from the first on.
+        times, size: number of blocks T, and size of a block n.
+        last_first: whether blocks are eliminated from the last to the first; blocks of the inverse
+            are then computed from the first on.
     """
 
     columns: Array
@@ -111,7 +111,7 @@ class BlockCholesky:
 
     @property
     def width(self) -> int:
-        """Number of diagonals below the main one."""
+        """Number of diagonals below the main diagonal."""
         return int(self.columns.shape[1]) - 1
 
     @cached_property
@@ -120,24 +120,24 @@ class BlockCholesky:
         return float(2.0 * elementary.log(self.columns[:, 0]).sum())
 
     def solve(self, right: Array) -> Array:
-        """P^-1 b of right sides b (..., T, n)."""
+        """P^-1 b for right-hand sides b (..., T, n)."""
         return self._applied(right, solve_band_lower, solve_band_transposed)
 
     def solve_lower(self, right: Array) -> Array:
-        """L^-1 b of right sides b (..., T, n)."""
+        """L^-1 b for right-hand sides b (..., T, n)."""
         return self._applied(right, solve_band_lower)
 
     def solve_transposed(self, right: Array) -> Array:
-        """L'^-1 b of right sides b (..., T, n): white noise becomes noise of covariance P^-1."""
+        """L'^-1 b for right-hand sides b (..., T, n): white noise b gets the covariance P^-1."""
         return self._applied(right, solve_band_transposed)
 
     def whiten(self, x: Array) -> Array:
-        """L' x of trajectories x (..., T, n), so that x' P x = |L' x|^2."""
+        """L' x for trajectories x (..., T, n), so that x' P x = |L' x|^2."""
         return self._applied(x, multiply_band_transposed)
 
     @cached_property
     def blocks(self) -> tuple[Array, Array]:
-        """The blocks of L: (T, n, n) lower triangular, and (T-1, n, n) below them."""
+        """Blocks of L: (T, n, n) on the diagonal, and (T-1, n, n) below the diagonal."""
         t, n, width = self.times, self.size, self.width
         own = np.tril(self._windows(0, t))
         row, column = np.indices((n, n))
@@ -145,10 +145,10 @@ class BlockCholesky:
         return own, below
 
     def inverse_blocks(self, count: int | None = None) -> Array:
-        """The first blocks, or all (T, n, n), on the diagonal of P^-1.
+        """Diagonal blocks (count, n, n) of P^-1 from the first on; None: all T blocks.
 
-        For a precision these are the marginal covariances. Backwards along L, with
-        G_t = L_{t+1,t} L_t^-1:
+        If P is a precision, these are the marginal covariances. The recursion runs backwards along
+        L, with G_t = L_{t+1,t} L_t^-1:
 
             C_T = (L_T L_T')^-1,    C_t = (L_t L_t')^-1 + G_t' C_{t+1} G_t
         """
@@ -163,11 +163,11 @@ class BlockCholesky:
 
     @cached_property
     def _inverse_blocks(self) -> list[Array]:
-        """Compute the requested blocks, backwards along L."""
+        """Blocks of the inverse computed so far, backwards along L."""
         return []
 
     def matrix(self) -> BlockTridiagonal:
-        """P."""
+        """Computes P = L L'."""
         own, below = self.blocks
         diagonal = product(own, own.swapaxes(1, 2))
         diagonal[1:] += product(below, below.swapaxes(1, 2))
@@ -177,9 +177,9 @@ class BlockCholesky:
         return BlockTridiagonal(diagonal, lower)
 
     def _windows(self, offset: int, count: int) -> Array:
-        """Blocks L[t n + offset + a, t n + b] for t < count, with rubbish outside the band.
+        """Blocks L[t n + offset + a, t n + b] for t < count; entries outside the band are garbage.
 
-        L[i, j] lies at i + j * width.
+        L[i, j] has the flat index i + j * width.
         """
         n, width = self.size, self.width
         padded = np.concatenate([self.columns.reshape(-1), np.zeros(n + offset)])
@@ -192,7 +192,7 @@ class BlockCholesky:
         )
 
     def _applied(self, vectors: Array, *functions: Callable[[Array, Array], None]) -> Array:
-        """The results of functions that overwrite vectors (..., T, n), one after the other."""
+        """Applies in-place functions to copies of vectors (..., T, n), one after the other."""
         order = slice(None, None, -1 if self.last_first else 1)
         trajectories = vectors.reshape(-1, self.times, self.size)[:, order]
         result = np.array(trajectories, order='C').reshape(-1, self.times * self.size)
@@ -202,7 +202,7 @@ class BlockCholesky:
 
 
 def bandwidth(lower: Array, n: int) -> int:
-    """Return the number of diagonals below the main one, for coupling blocks E_t (T-1, n, n)."""
+    """Number of diagonals below the main one, given the coupling blocks E_t (T-1, n, n)."""
     row, column = np.nonzero((lower != 0).any(axis=0))
     return max(n - 1, n + int((row - column).max(initial=-n)))
 

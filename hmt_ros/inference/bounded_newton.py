@@ -1,17 +1,17 @@
-"""Bounded damped Newton with a trust region, for a batch of small problems at once.
+"""Bounded damped Newton method with a trust region, for batches of small problems.
 
 Minimises E(x) subject to lower <= x <= upper (KJS 3.2, VMS 5). Every step minimises the damped
 quadratic model in the box,
 
     g.s + 1/2 s.(H + lambda W) s    subject to    lower - x <= s <= upper - x,
 
-by an active set: variables that the step drives across a limit are fixed at it, the others are
-solved again, and variables whose gradient points away from their limit are released. `TrustRegion`
-adapts lambda. Each problem has its own lambda and its own active set, and leaves the batch when it
-has converged.
+with an active set: variables that the step drives across a limit are fixed at the limit, the step
+of the others is solved again, and fixed variables that the energy pulls inwards are released.
+`TrustRegion` adapts lambda. Each problem has its own lambda and active set, and leaves the batch
+when it has converged.
 
-The damping expresses the trust in the model: the ratio of actual to predicted decrease sets lambda
-for the next step [Nielsen, Damping parameter in Marquardt's method, 1999]:
+The ratio of actual to predicted decrease sets the damping lambda of the next step [Nielsen, Damping
+parameter in Marquardt's method, 1999]:
 
     rho = (E(x) - E(x + s)) / (m(0) - m(s))
 
@@ -37,11 +37,12 @@ class Minimum:
     """Result of `minimise`, one row per problem.
 
     Attributes:
-        x: (N, d) minimiser.
-        value, gradient, hessian: (N,), (N, d), (N, d, d) of the energy there.
-        free: (N, d) whether a variable is not fixed at a limit.
-        status: (N,) of `Status`.
-        iterations: (N,) evaluations after the first.
+        x: (N, d) minimisers.
+        value, gradient, hessian: value (N,), gradient (N, d) and Hessian (N, d, d) of the energy at
+            `x`.
+        free: (N, d) False for variables fixed at a limit.
+        status: (N,) values of `Status`.
+        iterations: (N,) numbers of evaluations after the first.
     """
 
     x: Array
@@ -76,14 +77,13 @@ def minimise(
     """Minimises N problems from their starts x (N, d).
 
     Args:
-        term: the energy; rows are those of the N problems that have not converged yet. A function
-            of points and rows that returns value, gradient and Hessian will do.
-        x: starts (N, d); projected onto the box.
-        lower, upper: limits (d,) or (N, d), or scalars.
-        step_scale: (d,) length of a step that is moderate for each variable;
-            W = diag(step_scale^-2).
+        term: energy term; it is called with the rows of the problems that have not converged yet.
+            `EnergyFunction` wraps a function of points and rows.
+        x: starts (N, d), which are projected onto the box.
+        lower, upper: limits, (d,), (N, d) or scalar.
+        step_scale: (d,) typical step of each variable; W = diag(step_scale^-2).
         damping: first lambda, in units of energy.
-        max_iterations: evaluations per problem after the first one.
+        max_iterations: maximum number of evaluations per problem after the first.
         tolerance: predicted decrease of a step below which a problem has converged, in units of
             energy.
     """
@@ -118,7 +118,7 @@ def minimise(
             break
         start, low, high = x[active], lower[active], upper[active]
         trial = np.minimum(np.maximum(start + step, low), high)
-        # Rounding must not move a variable off the limit where it is fixed.
+        # Rounding must not move a fixed variable off its limit.
         trial = np.where(step <= low - start, low, trial)
         trial = np.where(step >= high - start, high, trial)
         found = term.energy(trial, active)
@@ -134,7 +134,7 @@ def minimise(
 
 
 def resting(x: Array, gradient: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
-    """Variables (N, d) on a limit with a gradient of the energy that pushes them outwards."""
+    """Mask (N, d) of variables on a limit that the energy pushes outwards."""
     return ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
 
 
@@ -148,17 +148,17 @@ class Status(IntEnum):
 
 
 class TrustRegion:
-    """The dampings of N problems, each with its own.
+    """Adapts the damping of each of N problems.
 
     Args:
-        count: N.
+        count: number of problems N.
         damping: first lambda.
-        limit: no step decreases the energy of a problem whose lambda is above it.
-        least_factor: a, lambda shrinks by at most this factor.
-        least_refused: b, lambda after a refused step is at least twice this.
+        limit: lambda above which a problem has stalled, because no step decreases its energy.
+        least_factor: smallest factor a on lambda after an accepted step.
+        least_refused: bound b: lambda after a refused step is at least 2 b.
 
     Attributes:
-        damping: (N,) lambda.
+        damping: (N,) lambda of each problem.
     """
 
     def __init__(
@@ -175,12 +175,13 @@ class TrustRegion:
         self._limit, self._least_factor, self._least_refused = limit, least_factor, least_refused
 
     def accept(self, rows: Index, decrease: Array, predicted: Array) -> NDArray[np.bool_]:
-        """Return the mask (n,) of accepted steps, and update their dampings.
+        """Return the mask (n,) of accepted steps, and update the damping of their problems.
 
         Args:
-            rows: (n,) the problems.
-            decrease: (n,) of their energies; values that are not finite are no decrease.
-            predicted: (n,) decrease, positive.
+            rows: (n,) indices of the problems.
+            decrease: (n,) decrease of the energies; values that are not finite count as no
+                decrease.
+            predicted: (n,) predicted decrease, positive.
         """
         ratio = np.where(np.isfinite(decrease), decrease, -np.inf) / predicted
         better: NDArray[np.bool_] = ratio > LEAST_RATIO
@@ -192,7 +193,7 @@ class TrustRegion:
         return better
 
     def refuse(self, rows: Index) -> Index:
-        """Increase the damping of problems (n,) with refused steps; return the stalled ones."""
+        """Increase the damping of problems (n,) with refused steps; return stalled problems."""
         self.damping[rows] = np.maximum(self.damping[rows], self._least_refused)
         self.damping[rows] *= self._growth[rows]
         self._growth[rows] *= 2.0

@@ -1,15 +1,15 @@
-"""Calibration of densities: the levels of known values in highest-density regions.
+"""Calibration of densities: levels of true values in highest-density regions.
 
 The level of a value x under a density p is the probability content of the smallest highest-density
 region that contains x,
 
     level(x) = P(p(X) > p(x)),  X ~ p,
 
-so that the highest-density region of probability q holds x exactly when level(x) <= q. Values that
-were drawn from their densities have levels that are uniform on [0, 1], whatever the densities are:
-the share of levels up to q is the coverage of the region q, to be compared with q. Best-of-N errors
-alone reward miscalibrated densities, see Pierzchlewicz et al., "Multi-hypothesis 3D human pose
-estimation metrics favor miscalibrated distributions" (2022).
+so that the highest-density region of probability q contains x exactly if level(x) <= q. Values
+drawn from their own densities have levels that are uniform on [0, 1], for any densities. The share
+of levels up to q is the coverage of the region of probability q, and should equal q. Best-of-N
+errors alone reward miscalibrated densities, see Pierzchlewicz et al., "Multi-hypothesis 3D human
+pose estimation metrics favor miscalibrated distributions" (2022).
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from hmt_ros.inference.random_numbers import standard_normals
 
 
 def levels_of(at_points: Array, at_samples: Array) -> Array:
-    """Share of samples whose density is above that of each point.
+    """Levels of points: shares of samples with a higher density than each point.
 
     Args:
-        at_points: (N, ...) densities of points, or any increasing function of them.
-        at_samples: (S, ...) the same of samples from the density; further axes are densities of
-            their own.
+        at_points: (N, ...) densities at the points, or any increasing function of the densities.
+        at_samples: (S, ...) the same function at samples from the density; further axes hold
+            further densities.
     """
     return np.asarray((at_samples[:, None] > at_points[None]).mean(0))
 
 
 def stratified_samples(mixture: GaussianMixture, count: int, rng: np.random.Generator) -> Array:
-    """Draw points (count, d), with numbers per component proportional to the weights."""
+    """Draw points (count, d); the number from each component is proportional to its weight."""
     cumulated = np.cumsum(mixture.normalised().weights)
     at = (np.arange(count) + rng.random()) / count
     owners = np.minimum(np.searchsorted(cumulated, at, side='right'), len(mixture) - 1)
@@ -49,7 +49,7 @@ def stratified_samples(mixture: GaussianMixture, count: int, rng: np.random.Gene
 
 
 def marginal_log_densities(mixture: GaussianMixture, points: ArrayLike, size: int) -> Array:
-    """log p of consecutive groups of `size` variables, (N, d / size), at points (N, d).
+    """Marginal log densities (N, d / size) of groups of `size` variables at points (N, d).
 
     Raises:
         ValueError: the dimension is not a multiple of the size.
@@ -80,11 +80,11 @@ def marginal_log_densities(mixture: GaussianMixture, points: ArrayLike, size: in
 
 
 def coverage(levels: ArrayLike, probability: float) -> float:
-    """Share of values that lie in their highest-density region of a probability."""
+    """Share of values inside their highest-density region of a given probability."""
     return float((np.asarray(levels) <= probability).mean())
 
 
 def calibration_error(levels: ArrayLike) -> float:
-    """Mean distance of coverage from probability, over the probabilities 0.05, 0.1, ... 0.95."""
+    """Mean absolute difference of coverage and probability, over 0.05, 0.1, ... 0.95."""
     probabilities = np.arange(1, 20) / 20
     return float(np.mean([abs(coverage(levels, p) - p) for p in probabilities]))

@@ -14,10 +14,10 @@ from hmt_ros.inference.linear_algebra import product
 def k_means(
     points: Array, count: int, rng: np.random.Generator, iterations: int = 25
 ) -> tuple[Array, Index]:
-    """Cluster points (N, p), into at most `count` clusters, fewer if fewer points differ.
+    """Cluster points (N, p) into at most `count` clusters, fewer if fewer points are distinct.
 
     Returns:
-        centres (K, p) and labels (N,). A cluster that loses all its points keeps its centre.
+        Centres (K, p) and labels (N,). A cluster that loses all its points keeps its centre.
     """
     centres = points[spread_points(points, count, rng)]
     for _ in range(iterations):
@@ -29,11 +29,11 @@ def k_means(
 
 
 def spread_points(points: Array, count: int, rng: np.random.Generator) -> Index:
-    """Indices of at most `count` of the points (N, p), spread like the data.
+    """Indices of at most `count` of the points (N, p), spread over the data.
 
-    The seeds of k-means++ [Arthur and Vassilvitskii, SODA 2007]: each next point is drawn in
-    proportion to its squared distance to the points before. The first few are spread as well. Equal
-    points are selected once.
+    The seeds of k-means++ [Arthur and Vassilvitskii, SODA 2007]: each point is drawn with a
+    probability proportional to its squared distance to the nearest selected point. The first few
+    points are spread over the data as well. Equal points are selected once.
     """
     chosen = [int(rng.integers(len(points)))]
     distance = np.full(len(points), np.inf)
@@ -49,7 +49,7 @@ def spread_points(points: Array, count: int, rng: np.random.Generator) -> Index:
 
 
 def smallest_columns(values: Array, count: int) -> Index:
-    """Columns (N, count), rising, of the smallest values (N, M) of each row.
+    """Ascending columns (N, count) of the smallest values in each row of (N, M).
 
     Ties are broken by position, because numpy's own selection depends on the processor.
     """

@@ -1,4 +1,4 @@
-"""Second-order dynamics: the velocity of a pose is damped and driven by coupled noise.
+"""Second-order dynamics: the velocity of a pose is damped, and driven by coupled noise.
 
     dx = v dt + dn,  E[dn dn'] = W dt              dv = -G v dt + dw,  E[dw dw'] = D dt
 
@@ -8,8 +8,8 @@ move together. The velocity has the stationary covariance S_ij = D_ij / (G_i + G
     x(t) ~ x + a v,   v(t) ~ b v,     a = (1 - exp(-G t)) / G,   b = exp(-G t)
     Q_xx = int a a' D + W t,   Q_xv = int a b' D,   Q_vv = int b b' D    (entry by entry, 0..t)
 
-The integrals are sums of exponentials; over short times, where these cancel, they are computed by
-Gaussian quadrature [Uhlenbeck and Ornstein 1930; Van Loan 1978 for the general case].
+The integrals are sums of exponentials. Over short times, in which the exponentials cancel, Gaussian
+quadrature computes them [Uhlenbeck and Ornstein 1930; Van Loan 1978 for the general case].
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import cholesky, inverse, product
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 
-# Nodes and weights of the quadrature, and the limit of G t below which it is exact to rounding.
+# Nodes and weights of the quadrature, and the bound on G t below which it is exact to rounding.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _LONGEST = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class DampedVelocity(LinearGaussianDynamics):
-    """Dynamics of poses and damped velocities, n = 2 d; made by `of`."""
+    """Dynamics of poses and damped velocities, n = 2 d; constructed by `of`."""
 
     @classmethod
     def of(
         cls, damping: ArrayLike, diffusion: ArrayLike, white: ArrayLike, *, step: float = 1.0
     ) -> DampedVelocity:
-        """Return the dynamics, with the stationary covariance for the first velocity.
+        """Return the dynamics; the first velocity has the stationary covariance.
 
         Args:
-            damping: (d,) G, share of the velocity lost per second.
-            diffusion: (d, d) D, covariance that the velocity gains per second.
-            white: (d,) W, additional variance that the pose gains per second.
+            damping: (d,) damping G, rate at which the velocity decays, per second.
+            diffusion: (d, d) diffusion D, covariance that the velocity gains per second.
+            white: (d,) white noise W, additional variance that the pose gains per second.
 
         Raises:
             ValueError: shapes are inconsistent, damping or white noise is not positive, or the
@@ -78,7 +78,7 @@ class DampedVelocity(LinearGaussianDynamics):
 
     @cached_property
     def damping(self) -> Array:
-        """(d,) G, per second."""
+        """Damping G (d,), per second."""
         d = self.dimension
         return -np.diagonal(self.drift)[d:]
 
@@ -95,7 +95,7 @@ class DampedVelocity(LinearGaussianDynamics):
         return moved, noise
 
     def _decay(self, interval: float) -> tuple[Array, Array]:
-        """a and b (d,): shift of the pose per velocity, and share of the velocity that lasts."""
+        """a and b (d,): shift of the pose per velocity, and remaining share of the velocity."""
         lost: Array = -elementary.expm1(-self.damping * interval)
         return lost / self.damping, 1.0 - lost
 
@@ -118,7 +118,7 @@ class DampedVelocity(LinearGaussianDynamics):
         )
 
     def predict(self, means: Array, covariances: Array, interval: float) -> tuple[Array, Array]:
-        """Means (K, n) and covariances (K, n, n) of states after an interval in seconds."""
+        """Predict means (K, n) and covariances (K, n, n) of states after an interval in seconds."""
         _, noise = self.transition(interval)
         moved, result = np.empty_like(means), np.empty_like(covariances)
         predict_damped(*self._decay(interval), noise, means, covariances, moved, result)

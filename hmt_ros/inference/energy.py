@@ -2,8 +2,8 @@
 
     E(x) = - sum_i log p_i(x),     g = dE/dx,     H ~ d2E/dx2
 
-Every factor of a density over x is an `EnergyTerm`. A posterior is the sum of its terms, and every
-optimiser takes such a sum (KJS 2 and 3.2, VMS 5).
+Every factor of a density over x is an `EnergyTerm`. The energy of a posterior is the sum of its
+terms, which every optimiser accepts (KJS 2 and 3.2, VMS 5).
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class Energy(NamedTuple):
     """Energies of N points; they add.
 
     Attributes:
-        value: (N,) nats.
-        gradient: (N, d); None: not requested.
-        hessian: (N, d, d); None: not requested.
+        value: (N,) energies, nats.
+        gradient: (N, d) gradients; None: not requested.
+        hessian: (N, d, d) Hessians; None: not requested.
     """
 
     value: Array
@@ -46,7 +46,7 @@ class Energy(NamedTuple):
         """Gradient and Hessian.
 
         Raises:
-            ValueError: they were not computed.
+            ValueError: a derivative was not computed.
         """
         if self.gradient is None or self.hessian is None:
             raise ValueError('the energy was computed without derivatives')
@@ -62,14 +62,14 @@ class EnergyTerm(Protocol):
         """Return the energy at points x (n, d).
 
         Args:
-            rows: (n,) index of the problem of each point, for terms whose data (centre, texture or
-                time) differ between problems.
+            rows: (n,) index of each point's problem, for terms with data (centre, texture or time)
+                that differ between problems.
         """
         ...
 
 
 def add_energies(energies: Iterable[Energy]) -> Energy:
-    """Sum energies of the same points, in the given order."""
+    """Add energies of the same points, in the given order."""
     first, *others = energies
     value, gradient, hessian = first
     if not others:
@@ -91,7 +91,8 @@ class EnergyFunction:
     """A term that wraps a function.
 
     Attributes:
-        function: maps points (n, d) and rows (n,) to value, gradient and any kind of Hessian.
+        function: function of points (n, d) and rows (n,) that returns value, gradient and any kind
+            of Hessian.
     """
 
     function: Callable[[Array, Index], tuple[Array, Array, Array]]
@@ -105,7 +106,7 @@ class EnergyFunction:
 
 @dataclass(frozen=True, eq=False)
 class Sum:
-    """A product of factors: the sum of their energies, in the given order."""
+    """Energy of a product of factors: the sum of their energies, in the given order."""
 
     terms: tuple[EnergyTerm, ...]
 
@@ -123,8 +124,8 @@ class Quadratic:
         E(x) = 1/2 (x - m)' P (x - m)
 
     Attributes:
-        centres: m, (d,) for all problems or (N, d).
-        precisions: P, (d,) diagonal or (d, d) for all problems, or (N, d, d).
+        centres: centres m, (d,) for all problems or (N, d).
+        precisions: precisions P, diagonal (d,) or full (d, d) for all problems, or (N, d, d).
     """
 
     centres: Array
@@ -153,12 +154,12 @@ class Student:
 
         E(x) = (nu + d)/2 log(1 + D/nu),     D = (x - m)' P (x - m)
 
-    Its Gauss-Newton Hessian is s P with the shrinkage s = (nu + d) / (nu + D), positive everywhere.
+    The Gauss-Newton Hessian is s P with the shrinkage s = (nu + d) / (nu + D) > 0.
 
     Attributes:
-        centres: m, (d,) for all problems or (N, d).
-        precisions: P, (d, d) for all problems, or (N, d, d).
-        degrees_of_freedom: nu.
+        centres: centres m, (d,) for all problems or (N, d).
+        precisions: precisions P, (d, d) for all problems, or (N, d, d).
+        degrees_of_freedom: degrees of freedom nu.
     """
 
     centres: Array

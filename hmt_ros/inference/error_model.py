@@ -4,13 +4,14 @@
     its share in time               a_g(dt) = (1 - rho) / (1 + rho) = tanh(dt / (2 tau_g)),
                                     rho = exp(-dt / tau_g)
 
-An error with the correlation time tau is an AR(1) process: its correlation between two measurements
-dt apart is rho. About a constant, n measurements in a row (n large) have the information of a(dt) n
-independent ones, so that each counts with the share a(dt) [Bartlett 1946]. For small dt it is dt /
-(2 tau): the information per second does not depend on the rate. For large dt it is 1.
+An error with the correlation time tau is an AR(1) process: errors of measurements dt apart have the
+correlation rho. A long series of n measurements of a constant has the information of a(dt) n
+independent ones, so each measurement counts with the share a(dt) [Bartlett 1946]. For small dt the
+share is dt / (2 tau): the information per second does not depend on the rate. For large dt the
+share is 1.
 
-A lasting error cancels in differences: the change of a pose from one measurement to the next is
-measured with the new part of the error alone, 1 - rho^2 of its variance.
+Persistent errors cancel in differences: the change of a pose between two measurements has only the
+error that is new, with 1 - rho^2 of the variance.
 """
 
 from __future__ import annotations
@@ -24,15 +25,15 @@ from hmt_ros.core import elementary
 
 
 def seconds(nanoseconds: int) -> float:
-    """A difference of stamps, in s."""
+    """Converts a difference of timestamps to seconds."""
     return 1e-9 * nanoseconds
 
 
 def share_of_time(dt: float, tau: float) -> float:
-    """Return a(dt), the information of a measurement relative to an independent one.
+    """Return a(dt), the information of a measurement relative to an independent measurement.
 
     Args:
-        dt: time since the measurement before, s; infinite for the first one.
+        dt: time since the previous measurement, s; infinite for the first.
         tau: correlation time of the errors, s; 0 for independent errors.
 
     Raises:
@@ -45,11 +46,11 @@ def share_of_time(dt: float, tau: float) -> float:
 
 @dataclass(frozen=True)
 class CueErrors:
-    """Duration of the errors of a cue.
+    """Error model of a cue.
 
     Attributes:
-        independent: Share of the cue's energy in one image that is independent.
-        time: Time for which errors of the cue last, s.
+        independent: Share s of independent information in the cue's energy in one image.
+        time: Correlation time tau of the errors of the cue, s.
         constant: Share c of the error variance of one image that is common to all images.
     """
 
@@ -58,44 +59,45 @@ class CueErrors:
     constant: float = 0.0
 
     def share(self, dt: float) -> float:
-        """Share of its energy, or curvature, that an image adds dt s after the last one."""
+        """Weight of the energy, or curvature, of an image dt s after the previous image."""
         return self.independent * share_of_time(dt, self.time)
 
     def together(self, count: float) -> float:
-        """Factor on the summed information of images about a constant.
+        """Factor on the summed information of many images of one constant.
 
-        The mean of n of them has the variance 1 / n + c: n / (1 + c n) times the information of 1.
+        The mean over n images has the variance 1 / n + c, that is n / (1 + c n) times the
+        information of one.
 
         Args:
-            count: n, the sum of their shares.
+            count: number n of images, that is the sum of their shares.
         """
         return 1.0 / (1.0 + self.constant * count)
 
     def of_changes(self, dt: float) -> float:
-        """Share of the curvature of an image that measures the change of a pose in dt s.
+        """Weight of the curvature of an image as a measurement of the change of a pose in dt s.
 
-        A lasting error has not changed: s / (1 - rho^2), by the variance of its new part.
+        Only the new part of the error counts, so the weight is s / (1 - rho^2).
         """
         new = -float(elementary.expm1(-2.0 * dt / self.time)) if self.time > 0.0 else 1.0
         return self.independent / new
 
     def lasting(self, dt: float) -> float:
-        """Ratio of both shares, 1 / (1 - rho)^2: lasting variance over variance of changes."""
+        """Ratio 1 / (1 - rho)^2 of `of_changes` to `share`, which scales variances."""
         return self.of_changes(dt) / self.share(dt)
 
 
 def errors_of_cues(amounts: Mapping[str, float]) -> CueErrors:
-    """Combine the errors of several cues in one likelihood to one pair (s, tau).
+    """Combine the error models of several cues in one likelihood into one pair (s, tau).
 
         s = sum_g c_g s_g / C,    s / tau = sum_g c_g s_g / tau_g / C,    C = sum_g c_g
 
     c_g is the contribution of cue g to the likelihood: the number of variables that its curvature
-    determines. At low rates the likelihood then counts with the mean of the shares of its cues, and
-    at high rates a second of images has the information of its cues; in between the share is an
-    approximation, and exact where all tau_g are one.
+    determines. At low rates the likelihood then counts with the mean share of its cues. At high
+    rates, the images of a second have the same information as with separate cues. In between the
+    share is an approximation; with equal tau_g it is exact.
 
     Args:
-        amounts: c_g by name of the cue in `ERRORS`, none negative, not all 0.
+        amounts: contributions c_g by name of the cue in `ERRORS`, none negative, not all 0.
 
     Raises:
         ValueError: an amount is negative or not finite, or all are 0.
@@ -111,15 +113,15 @@ def errors_of_cues(amounts: Mapping[str, float]) -> CueErrors:
     return CueErrors(share, share / rate)
 
 
-# Covariance of a pose given all images so far, over that given the last image alone with its own
-# share of the evidence; see `benchmarks/joint_errors.py`.
+# Ratio of the covariance of a pose given all images so far to that given the last image alone, with
+# its share of the evidence; see `benchmarks/joint_errors.py`.
 TOGETHER = 0.29
 
-# Chosen, not learned, at 30 and 3 images a second (docs/tracking.md). The prior of the pose is
-# counted like a cue, because the same pose is judged again in every image. `lifted` are the depths
-# of experts, beside a weight of their own. `shape` is the evidence of images on lengths and flesh:
-# different poses are independent evidence on these, but not on clothes. Its constant share was
-# chosen on clips that are shown back and forth for 45 s: 0.03, 0.12 and 0.3 were tried.
+# Chosen, not learned, at 30 and 3 images per second (docs/tracking.md). The prior of the pose is
+# discounted like a cue, because it evaluates the same pose again in every image. `lifted` are the
+# depths from experts, which also have a weight of their own. `shape` is the evidence from images on
+# lengths and flesh: different poses are independent evidence on these, but not on clothes. Its
+# constant share was chosen among 0.03, 0.12 and 0.3 on clips played back and forth for 45 s.
 _IMAGE, _KEYPOINTS = CueErrors(0.15, 0.019), CueErrors(0.35, 0.053)
 ERRORS: Mapping[str, CueErrors] = MappingProxyType(
     {
@@ -130,8 +132,8 @@ ERRORS: Mapping[str, CueErrors] = MappingProxyType(
         'shape': replace(_KEYPOINTS, constant=0.12),
     }
 )
-# Factor on the depths of experts where they are counted like keypoints: the ratio of the
-# information of both in a second of many images.
+# Factor on the depths from experts if they are discounted like keypoints: the ratio of the
+# information per second of both at a high rate.
 LIFTED_AS_KEYPOINTS = (
     ERRORS['lifted'].independent
     / ERRORS['lifted'].time

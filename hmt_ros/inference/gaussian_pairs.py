@@ -1,4 +1,4 @@
-"""Distances and overlaps of pairs of Gaussians, many at once.
+"""Distances and overlaps of many pairs of Gaussians.
 
 D = (a - b)' C^-1 (a - b),     log N(a; b, C) = -1/2 (D + log |C| + d log(2 pi)),     C = A + B
 """
@@ -21,7 +21,7 @@ LEAST_SHARED = 128
 def pair_log_densities(
     means_a: Array, covariances_a: Array, means_b: Array, covariances_b: Array, pairs: Index
 ) -> Array:
-    """log N(a_i; b_j, A_i + B_j), shape (P,), of pairs (P, 2) of indices i, j."""
+    """log N(a_i; b_j, A_i + B_j), shape (P,), for pairs (P, 2) of indices i, j."""
     squares, log_determinants = _of_pairs(
         pairs, np.ones((len(pairs), 2)), means_a, covariances_a, means_b, covariances_b
     )
@@ -30,17 +30,17 @@ def pair_log_densities(
 
 
 def pair_distances(means: Array, covariances: Array, scales: Array, pairs: Index) -> Array:
-    """(m_i - m_j)' (s_i C_i + s_j C_j)^-1 (m_i - m_j), shape (P,), of pairs (P, 2)."""
+    """(m_i - m_j)' (s_i C_i + s_j C_j)^-1 (m_i - m_j), shape (P,), for pairs (P, 2)."""
     return _of_pairs(pairs, scales[pairs], means, covariances, means, covariances)[0]
 
 
 def pair_mixture_log_determinants(
     means: Array, covariances: Array, weights: Array, pairs: Index
 ) -> Array:
-    """log |S|, shape (P,), of the covariances S that pairs (P, 2) of weighted Gaussians have.
+    """log |S|, shape (P,), for the joint covariance S of pairs (P, 2) of weighted Gaussians.
 
-    S = a A + b B + a b D D' with the shares a + b = 1 of the weights and the offset D of the means,
-    so that log |S| = log |a A + b B| + log(1 + a b D' (a A + b B)^-1 D).
+    S = a A + b B + a b D D' with the normalised weights a + b = 1 and the offset D of the means, so
+    that log |S| = log |a A + b B| + log(1 + a b D' (a A + b B)^-1 D).
     """
     shares = weights[pairs] / weights[pairs].sum(1, keepdims=True)
     squares, log_determinants = _of_pairs(pairs, shares, means, covariances, means, covariances)
@@ -48,10 +48,10 @@ def pair_mixture_log_determinants(
 
 
 def _of_pairs(pairs: Index, scales: Array, *sets: Array) -> tuple[Array, Array]:
-    """D and log |C|, both (P,), of pairs from two sets of means and covariances.
+    """D and log |C|, both (P,), for pairs from two sets of means and covariances.
 
     Args:
-        pairs: (P, 2).
+        pairs: (P, 2) indices in the first set and in the second.
         scales: (P, 2) factors on the two covariances of each pair.
         *sets: means and covariances of the first set, and of the second.
     """

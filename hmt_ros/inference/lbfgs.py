@@ -1,10 +1,10 @@
-"""L-BFGS: minimisation by gradients, with a line search for the strong Wolfe conditions.
+"""L-BFGS: minimisation with gradients, and a line search for the strong Wolfe conditions.
 
     d = -H g,   H from the last pairs of steps and changes of the gradient      [Nocedal, 1980]
     f(x + a d) <= f(x) + 1e-3 a g.d,   |g(x + a d).d| <= 0.9 |g.d|        [More, Thuente, 1994]
 
-The iterates are those of L-BFGS-B without bounds. Its library calls BLAS, whose sums depend on the
-processor.
+The iterates equal those of L-BFGS-B without bounds. The library L-BFGS-B is not used, because it
+calls BLAS, whose sums depend on the processor.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ Function = Callable[[Array], tuple[float, Array]]
 def descent(
     function: Function, start: Array, *, memory: int, most_evaluations: int
 ) -> Iterator[tuple[Array, float]]:
-    """Yield each next iterate and its value, until the value decreases no further.
+    """Yield each iterate and its value, until the value decreases no further.
 
     Args:
-        function: value and gradient (n,) at a point (n,).
-        start: (n,).
-        memory: number of stored pairs.
+        function: function that returns value and gradient (n,) at a point (n,).
+        start: (n,) first point.
+        memory: maximum number of stored pairs.
         most_evaluations: number of evaluations after which the descent ends.
     """
     x = start
@@ -74,7 +74,7 @@ def _dot(a: Array, b: Array) -> float:
 
 
 def _product(pairs: list[tuple[Array, Array, float]], gradient: Array) -> Array:
-    """H g."""
+    """Product H g of the inverse Hessian approximation and the gradient."""
     result, shares = gradient.copy(), []
     for step, change, curvature in reversed(pairs):
         shares.append(_dot(step, result) / curvature)
@@ -89,14 +89,14 @@ def _product(pairs: list[tuple[Array, Array, float]], gradient: Array) -> Array:
 
 @dataclass(frozen=True)
 class _At:
-    """A step, the value there and the slope."""
+    """Value and slope at a step."""
 
     step: float
     value: float
     slope: float
 
     def less(self, slope: float) -> _At:
-        """The same for the function minus a line."""
+        """Subtracts a line of the given slope from the function."""
         return _At(self.step, self.value - self.step * slope, self.slope - slope)
 
 
@@ -104,7 +104,7 @@ class LineSearch:
     """A line search: the caller evaluates `step` and passes value and slope to `advance`.
 
     Attributes:
-        step: the next step to evaluate, or the one that was found.
+        step: next step to evaluate, or the step found.
         found: whether the step satisfies the conditions.
         ended: whether the search is over.
         count: number of evaluations.
@@ -118,7 +118,7 @@ class LineSearch:
         self._width, self._before = LARGEST_STEP, 2.0 * LARGEST_STEP
 
     def advance(self, value: float, slope: float) -> None:
-        """Takes the value and the slope at the step."""
+        """Advances the search with the value and the slope at `step`."""
         self.count += 1
         here, test = _At(self.step, value, slope), DECREASE * self._start.slope
         low, high = self._range
@@ -129,7 +129,7 @@ class LineSearch:
         stuck = self._bracketed and (not low < here.step < high or high - low <= NARROW * high)
         at_end = here.step == LARGEST_STEP and lower and here.slope <= test
         if (lower and flat) or stuck or at_end:
-            # L-BFGS also accepts the step of a search that can not continue.
+            # L-BFGS also accepts the last step of a search that cannot continue.
             self.found = self.ended = True
             return
         shift = test if self._modified and here.value <= self._best.value and not lower else 0.0
@@ -159,7 +159,7 @@ class LineSearch:
 def _next(
     best: _At, other: _At, here: _At, bracketed: bool, low: float, high: float
 ) -> tuple[_At, _At, float, bool]:
-    """The ends of the new interval, the next step, and whether a minimum lies between."""
+    """Ends of the new interval, next step, and whether the interval brackets a minimum."""
     opposite = here.slope * math.copysign(1.0, best.slope) < 0.0
     far = here.step - best.step
     secant = (
@@ -206,7 +206,7 @@ def _next(
 
 
 def _cubic(one: _At, here: _At, negative: bool) -> tuple[float, float]:
-    """Of the cubic through two points with their slopes."""
+    """Terms theta and gamma of the cubic through two points with their slopes."""
     theta = 3.0 * (one.value - here.value) / (here.step - one.step) + one.slope + here.slope
     scale = max(abs(theta), abs(one.slope), abs(here.slope))
     inner = (theta / scale) ** 2 - one.slope / scale * (here.slope / scale)

@@ -1,9 +1,9 @@
-"""Linear algebra with the same bytes on every processor.
+"""Linear algebra with bit-identical results on every processor.
 
-BLAS and LAPACK, which numpy calls, choose their kernels by processor, and these sum in different
-orders. The functions of this module sum in one order; they broadcast over leading axes, and a
-matrix without a result raises `numpy.linalg.LinAlgError`, as with numpy. They are meant for
-matrices of up to some hundreds of rows.
+BLAS and LAPACK, which numpy calls, choose kernels by processor, and these add in different orders.
+The functions of this module add in a fixed order. They broadcast over leading axes, and raise
+`numpy.linalg.LinAlgError` if there is no result, as numpy does. They are meant for matrices of up
+to some hundreds of rows.
 """
 
 from collections.abc import Callable
@@ -16,16 +16,16 @@ from hmt_ros.core import matrices
 
 Array = NDArray[np.float64]
 
-# The matrix product, as `numpy.matmul`; of float32 where both are, else of float64.
+# Matrix product like `numpy.matmul`, in float32 if both operands are float32, else in float64.
 product: Callable[..., Any] = matrices.product
 
-# log sum exp(x) along the last axis, or along `axis`, as `numpy.logaddexp.reduce`.
+# log sum exp(x) along the last axis, or along `axis`, like `numpy.logaddexp.reduce`.
 log_sum_exp: Callable[..., Any] = matrices.log_sum_exp
 
-# Mean distance (...) of points (..., P, c) from others.
+# Mean distance (...) between corresponding points (..., P, c) of two sets.
 mean_distances: Callable[..., Any] = matrices.mean_distance
 
-# Distances (..., N, N) of vectors (..., N, k) from each other.
+# Pairwise distances (..., N, N) of vectors (..., N, k).
 distances: Callable[..., Any] = matrices.distances
 
 
@@ -42,13 +42,13 @@ _NOT_CONVERGED = 'no convergence, or a matrix that is not finite'
 
 
 def length(vector: ArrayLike) -> float:
-    """Euclidean length of a vector, or root of the sum of squares of any array."""
+    """Euclidean length of a vector, or Frobenius norm of an array."""
     vector = np.asarray(vector)
     return float(np.sqrt((vector * vector).sum()))
 
 
 def unit(vectors: Array) -> Array:
-    """Vectors (..., n) of length 1."""
+    """Scales vectors (..., n) to length 1."""
     return np.asarray(vectors / np.sqrt((vectors * vectors).sum(-1, keepdims=True)))
 
 
@@ -60,14 +60,14 @@ def cholesky(matrix: ArrayLike) -> Array:
 
 
 def solve(matrix: ArrayLike, right: ArrayLike) -> Array:
-    """X of A X = B, for A (..., n, n) and B (..., n, m), or one vector (n,)."""
+    """Solution X of A X = B, for A (..., n, n) and B (..., n, m), or one vector (n,)."""
     return _solved(matrices.solve, matrix, right)
 
 
 def solve_triangular(
     factor: ArrayLike, right: ArrayLike, *, lower: bool = True, transposed: bool = False
 ) -> Array:
-    """X of A X = B, or of A^T X = B, for a triangle A (..., n, n); the other half is not read."""
+    """Solution of A X = B, or A^T X = B, for a triangular A (..., n, n); reads one triangle."""
     if transposed:
         factor, lower = np.swapaxes(factor, -1, -2), not lower
     return _solved(matrices.solve_lower if lower else matrices.solve_upper, factor, right)
@@ -81,7 +81,7 @@ def inverse(matrix: ArrayLike) -> Array:
 
 
 def inverse_triangular(factor: ArrayLike) -> Array:
-    """Inverse of a lower triangle (..., n, n)."""
+    """Inverse of a lower triangular matrix (..., n, n)."""
     return solve_triangular(factor, np.eye(np.shape(factor)[-1]))
 
 
@@ -99,29 +99,29 @@ def determinant(matrix: ArrayLike) -> Array:
 
 
 def log_determinant(matrix: ArrayLike) -> Array:
-    """Logarithm of the size of the determinant of a matrix (..., n, n); -inf if singular."""
+    """Log of the absolute determinant of a matrix (..., n, n); -inf if singular."""
     result: Array = matrices.determinant(matrix)[1]
     return result
 
 
 def symmetric_eigen(matrix: ArrayLike) -> tuple[Array, Array]:
-    """Eigenvalues (..., n), rising, and vectors (..., n, n) by columns, from the lower triangle."""
+    """Ascending eigenvalues (..., n), eigenvectors (..., n, n) in columns; reads the lower half."""
     with _checked(_NOT_CONVERGED):
         values, vectors = matrices.symmetric_eigen(matrix)
     return values, vectors
 
 
 def symmetric_eigenvalues(matrix: ArrayLike) -> Array:
-    """Eigenvalues (..., n), rising, of a symmetric matrix, from its lower triangle."""
+    """Ascending eigenvalues (..., n) of a symmetric matrix; reads the lower triangle."""
     with _checked(_NOT_CONVERGED):
         result: Array = matrices.symmetric_eigenvalues(matrix)
     return result
 
 
 def singular_values(matrix: ArrayLike) -> tuple[Array, Array, Array]:
-    """U (..., m, k), the singular values (..., k), falling, and V^T (..., k, n); k = min(m, n).
+    """U (..., m, k), descending singular values (..., k), and V^T (..., k, n); k = min(m, n).
 
-    A column of U, or a row of V^T if m < n, is 0 where its singular value is 0.
+    If a singular value is 0, its column of U, or its row of V^T for m < n, is 0.
     """
     matrix = np.asarray(matrix)
     if matrix.shape[-2] < matrix.shape[-1]:
@@ -133,7 +133,7 @@ def singular_values(matrix: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 def pseudo_inverse(matrix: ArrayLike, tolerance: float = 1e-15) -> Array:
-    """Moore-Penrose inverse (..., n, m); singular values up to `tolerance` max s count as 0."""
+    """Moore-Penrose inverse (..., n, m); singular values s up to `tolerance` max s count as 0."""
     u, values, vt = singular_values(matrix)
     large = values > tolerance * values[..., :1]
     inverses = np.divide(1.0, values, out=np.zeros_like(values), where=large)

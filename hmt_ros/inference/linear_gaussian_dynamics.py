@@ -1,11 +1,11 @@
-"""Linear Gaussian dynamics in continuous time, and the prior over trajectories that they imply.
+"""Linear Gaussian dynamics in continuous time, and the implied prior over trajectories.
 
     dx = F x dt + dw,  E[dw dw'] = Qc dt     =>     p(x_{t+1} | x_t) = N(A x_t, Q)
     A = exp(F dt),  Q = int_0^dt exp(F s) Qc exp(F s)' ds                       [Van Loan 1978]
 
-so that gaps and uneven intervals need no further rule: predicting over two intervals equals
-predicting over their sum. The random walk has F = 0; with constant velocity the state is the pose
-and its velocity, and the acceleration is white noise.
+so that gaps and uneven intervals need no special treatment: predictions over two intervals equal
+the prediction over their sum. The random walk has F = 0; with constant velocity the state consists
+of the pose and its velocity, and the acceleration is white noise.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ class TrajectoryPrior:
     """-log p(X) = 1/2 X'PX - h'X + c over states X (T, n).
 
     Attributes:
-        precision: P.
-        information: (T, n) h.
-        constant: c, nats; an unknown first pose has density 1.
-        dimension: d; the first d variables of each state are the pose.
+        precision: block-tridiagonal matrix P.
+        information: (T, n) vector h.
+        constant: constant c, nats; an unknown first pose has density 1.
+        dimension: number d of pose variables, which come first in each state.
     """
 
     precision: BlockTridiagonal
@@ -51,13 +51,13 @@ class TrajectoryPrior:
     dimension: int
 
     def energy(self, states: Array) -> tuple[Array, Array]:
-        """-log p (N,) and its gradient (N, T, n) at trajectories (N, T, n)."""
+        """Return -log p (N,) and its gradient (N, T, n) at trajectories (N, T, n)."""
         moved = self.precision.product(states)
         value = (states * (0.5 * moved - self.information)).sum((-2, -1))
         return value + self.constant, moved - self.information
 
     def between(self, first: int, last: int, states: Array) -> TrajectoryPrior:
-        """Condition the states first <= t < last on the others of one trajectory (T, n).
+        """Condition the states with first <= t < last on the other states of a trajectory (T, n).
 
         The density is unnormalised: its constant is 0.
         """
@@ -73,12 +73,13 @@ class TrajectoryPrior:
 
 
 class Couplings(NamedTuple):
-    """Terms that couple T states, by the interval between two of them.
+    """Terms that couple T successive states, for each different interval between two.
 
     Attributes:
-        before, after, forth: (I, n, n) A' Q^-1 A, Q^-1 and Q^-1 A of the different intervals.
-        which: (T-1,) the interval after each state but the last.
-        log_determinants: (T-1,) log |Q|.
+        before, after, forth: (I, n, n) matrices A' Q^-1 A, Q^-1 and Q^-1 A of I different
+            intervals.
+        which: (T-1,) index of the interval after each state but the last.
+        log_determinants: (T-1,) log |Q| of the interval after each state.
     """
 
     before: Array
@@ -88,7 +89,7 @@ class Couplings(NamedTuple):
     log_determinants: Array
 
     def constant(self, noise: Array) -> float:
-        """Return -log of the densities at their modes, nats, with factors (T-1,) on the noise."""
+        """Return -log of the peak densities, nats, with factors (T-1,) on the noise."""
         n = self.before.shape[1]
         logs = n * elementary.log(2.0 * np.pi * noise) + self.log_determinants
         return 0.5 * float(logs.sum())
@@ -102,12 +103,12 @@ class LinearGaussianDynamics:
     diffusion.
 
     Attributes:
-        drift: (n, n) F, per second.
-        diffusion: (n, n) Qc, covariance gained per second.
-        dimension: d, number of observed variables; the others are velocities.
+        drift: (n, n) drift F, per second.
+        diffusion: (n, n) diffusion Qc, covariance gained per second.
+        dimension: number d of observed variables; the others are velocities.
         initial_mean: (n,) mean of the first state.
-        initial_precision: (n, n) precision of the first state; zeros where unknown.
-        step: interval between observations without stamps, s.
+        initial_precision: (n, n) precision of the first state; zero for unknown variables.
+        step: interval between observations without timestamps, s.
 
     Raises:
         ValueError: a shape is wrong, a value is not finite, or a diffusion is not positive
@@ -169,11 +170,11 @@ class LinearGaussianDynamics:
         *,
         step: float = 1.0,
     ) -> LinearGaussianDynamics:
-        """Return second-order dynamics; the state is the pose, unknown at first, and its velocity.
+        """Return second-order dynamics of pose and velocity; the first pose is unknown.
 
         Args:
             rates: (d,) variances, or (d, d) covariance, gained by the velocity per second.
-            velocity_sigma: (d,) or scalar, standard deviation of the first velocity, per second.
+            velocity_sigma: standard deviation of the first velocity, (d,) or scalar, per second.
         """
         white = _matrix(rates)
         d = len(white)
@@ -193,7 +194,7 @@ class LinearGaussianDynamics:
 
     @cached_property
     def transition(self) -> Callable[[float], tuple[Array, Array]]:
-        """A and Q, both (n, n), over an interval in seconds; the most recent ones are cached."""
+        """Function that returns A and Q, (n, n), for an interval in seconds; results are cached."""
 
         def made(interval: float) -> tuple[Array, Array]:
             found = self._transition(interval)
@@ -205,7 +206,7 @@ class LinearGaussianDynamics:
 
     @cached_property
     def coupling(self) -> Callable[[float], tuple[Array, Array, Array, float]]:
-        """A' Q^-1 A, Q^-1 and Q^-1 A, all (n, n), and log |Q|; cached like transitions."""
+        """Function that returns A' Q^-1 A, Q^-1 and Q^-1 A, (n, n), and log |Q|; cached."""
         return lru_cache(MOST_INTERVALS)(self._coupling)
 
     def _coupling(self, interval: float) -> tuple[Array, Array, Array, float]:
@@ -239,7 +240,7 @@ class LinearGaussianDynamics:
     def states(self, covariances: Array) -> Array:
         """Return covariances (K, n, n) of states from covariances (K, d, d) of their poses.
 
-        All velocities have the covariance of the first one.
+        All velocities have the covariance of the first velocity.
         """
         d, n = self.dimension, self.state_dimension
         if n == d:
@@ -255,7 +256,7 @@ class LinearGaussianDynamics:
         """Predict means (K, d) and covariances (K, d, d) of poses with unknown velocities.
 
         Args:
-            means, covariances: (K, d) and (K, d, d) of the poses.
+            means, covariances: means (K, d) and covariances (K, d, d) of the poses.
         """
         d = self.dimension
         first = np.broadcast_to(self.initial_mean[d:], (len(means), self.state_dimension - d))
@@ -286,12 +287,12 @@ class LinearGaussianDynamics:
     def prior(
         self, intervals: Array, *, initial: bool = True, noise: ArrayLike = 1.0
     ) -> TrajectoryPrior:
-        """Return the density of trajectories with given intervals between their states.
+        """Return the prior over trajectories with given intervals between their states.
 
         Args:
             intervals: (T-1,) intervals, s.
             initial: whether to include the prior of the first state.
-            noise: (T-1,) or scalar, factor on the noise over each interval.
+            noise: factor on the noise over each interval, (T-1,) or scalar.
 
         Raises:
             ValueError: the noise over an interval is not positive definite.
@@ -323,7 +324,7 @@ class LinearGaussianDynamics:
 
 
 def _precision_of(covariance: Array) -> tuple[Array, float]:
-    """Return inverse and log determinant; diagonal covariances give exactly diagonal inverses."""
+    """Return inverse and log determinant; the inverse of a diagonal matrix is exactly diagonal."""
     diagonal = np.diagonal(covariance)
     if not (covariance - np.diag(diagonal)).any() and (diagonal > 0).all():
         return np.diag(1.0 / diagonal), float(elementary.log(diagonal).sum())

@@ -1,4 +1,4 @@
-"""Probabilities and their log odds."""
+"""Conversion between probabilities and log odds."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hmt_ros.inference.arrays import Array
 
 
 def log_odds(probability: ArrayLike) -> Array:
-    """log(p / (1 - p)); infinite at 0 and 1."""
+    """Log odds log(p / (1 - p)) of probabilities; infinite at 0 and 1."""
     p = np.asarray(probability, dtype=np.float64)
     with np.errstate(divide='ignore'):
         result: Array = elementary.log(p) - elementary.log1p(-p)
@@ -18,7 +18,7 @@ def log_odds(probability: ArrayLike) -> Array:
 
 
 def probability_of(odds: ArrayLike) -> Array:
-    """1 / (1 + exp(-x)) of log odds."""
+    """Probabilities 1 / (1 + exp(-x)) from log odds x."""
     x = np.asarray(odds, dtype=np.float64)
     e = elementary.exp(-np.abs(x))
     return np.asarray(np.where(x < 0.0, e, 1.0) / (1.0 + e))

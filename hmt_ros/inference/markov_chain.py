@@ -23,7 +23,7 @@ from hmt_ros.inference.logistic import probability_of
 
 @dataclass(frozen=True, eq=False)
 class MarkovChain:
-    """The states of a chain and the rates between them.
+    """Markov chain with given rates between its states.
 
     Attributes:
         rates: (n, n) rates from state i to state j, 1/s; the diagonal is ignored.
@@ -33,7 +33,13 @@ class MarkovChain:
 
     @classmethod
     def of_two(cls, begins: float, ends: float) -> MarkovChain:
-        """A chain of the states 'not' and 'is', by the rates at which it begins and ends, 1/s."""
+        """Chain with two states, given the rates at which the second begins and ends, 1/s.
+
+        Example:
+            >>> chain = MarkovChain.of_two(begins=1.0, ends=3.0)
+            >>> chain.predict([1.0, 0.0], 0.1).round(3), chain.usual
+            (array([0.918, 0.082]), array([0.75, 0.25]))
+        """
         return cls(np.array([[0.0, begins], [ends, 0.0]]))
 
     @cached_property
@@ -45,7 +51,7 @@ class MarkovChain:
     @cached_property
     def usual(self) -> Array:
         """Stationary probabilities (n,)."""
-        # p Q = 0, one equation of which follows from the others, and sum p = 1.
+        # Solve p Q = 0 with sum p = 1, which replaces a redundant equation.
         equations = self.generator.T.copy()
         equations[-1] = 1.0
         found = solve(equations, np.eye(len(equations))[-1])
@@ -54,30 +60,31 @@ class MarkovChain:
 
     @cached_property
     def _rate(self) -> float:
-        """Decay rate of a chain of two states to its stationary probabilities, 1/s."""
+        """Rate at which a chain of two states decays to its stationary probabilities, 1/s."""
         return float(self.rates[0, 1] + self.rates[1, 0])
 
     def transition(self, dt: float) -> Array:
-        """Probabilities (n, n) of state j a time dt, s, after state i."""
+        """Probabilities (n, n) of state j, dt seconds after state i."""
         if len(self.rates) == 2:
             share = -elementary.expm1(-self._rate * dt)
             return np.asarray((1.0 - share) * np.eye(2) + share * self.usual)
         return exponential(self.generator * dt)
 
     def predict(self, p: ArrayLike, dt: float) -> Array:
-        """Probabilities (..., n) a time dt, s, after p (..., n)."""
+        """Predicts probabilities (..., n) dt seconds after p (..., n)."""
         return np.asarray(product(p, self.transition(dt)))
 
     def closed(self, p: ArrayLike, dt: float) -> Array:
-        """The same for two states, by the closed form: probabilities (...) of the second one."""
+        """Predicts probabilities (...) of the second of two states, by the closed form."""
         return np.asarray(p + (p - self.usual[1]) * elementary.expm1(-self._rate * dt))
 
 
 def update(p: ArrayLike, log_likelihoods: ArrayLike) -> Array:
-    """Probabilities (..., n) after p (..., n), given an observation.
+    """Updates probabilities p (..., n) of the states with an observation.
 
     Args:
-        log_likelihoods: (..., n) of the observation in each state, nats, up to a constant.
+        log_likelihoods: (..., n) log likelihoods of the observation in each state, nats, up to a
+            constant.
     """
     with np.errstate(divide='ignore'):
         log_p = elementary.log(p) + log_likelihoods
@@ -85,6 +92,6 @@ def update(p: ArrayLike, log_likelihoods: ArrayLike) -> Array:
 
 
 def of_log_odds(log_odds: ArrayLike) -> Array:
-    """Probabilities (..., 2) of a chain of two states, by the log odds of the second one, nats."""
+    """Probabilities (..., 2) of two states, from the log odds of the second, nats."""
     is_so = probability_of(log_odds)
     return np.stack([1.0 - is_so, is_so], axis=-1)

@@ -2,8 +2,7 @@
 
     p(x) = sum_k w_k N(x; m_k, S_k)
 
-The posterior, the likelihood and the prediction of a pose are all of this form (KJS 4,
-VMS 4, BME 2).
+Posterior, likelihood and prediction of a pose all have this form (KJS 4, VMS 4, BME 2).
 """
 
 from __future__ import annotations
@@ -26,16 +25,21 @@ from hmt_ros.inference.random_numbers import standard_normals
 class GaussianMixture:
     """A mixture of K Gaussians over R^d.
 
-    Weights need not sum to 1: the modes of a likelihood are an unnormalised mixture. `normalised()`
-    makes the weights sum to 1.
+    Weights need not sum to 1, because the modes of a likelihood form an unnormalised mixture; see
+    `normalised`.
 
     Attributes:
-        weights: (K,) nonnegative.
-        means: (K, d).
-        covariances: (K, d, d) symmetric, positive definite.
+        weights: (K,) weights, not negative.
+        means: (K, d) means.
+        covariances: (K, d, d) covariances, symmetric and positive definite.
 
     Raises:
         ValueError: shapes are inconsistent, a value is not finite, or a weight is negative.
+
+    Example:
+        >>> two = GaussianMixture([0.5, 0.5], [[-1.0], [1.0]], [[[0.25]], [[0.25]]])
+        >>> two.mean(), two.covariance(), two.log_density([[0.0]]).round(3)
+        (array([0.]), array([[1.25]]), array([-2.226]))
     """
 
     weights: Array
@@ -98,7 +102,7 @@ class GaussianMixture:
             ) from None
 
     def component_log_densities(self, x: ArrayLike) -> Array:
-        """log N(x; m_k, S_k), shape (N, K), of points x (N, d)."""
+        """Log densities log N(x; m_k, S_k), (N, K), at points x (N, d)."""
         points = np.asarray(x, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != self.dimension:
             raise ValueError(f'points have shape {points.shape}, wanted (N, {self.dimension})')
@@ -112,7 +116,7 @@ class GaussianMixture:
         return result
 
     def log_density(self, x: ArrayLike) -> Array:
-        """log p(x), shape (N,), of points x (N, d)."""
+        """Log density log p(x), (N,), at points x (N, d)."""
         with np.errstate(divide='ignore'):
             log_weights = elementary.log(self.weights)
         return np.asarray(log_sum_exp(self.component_log_densities(x) + log_weights))
@@ -136,7 +140,7 @@ class GaussianMixture:
         return np.asarray(within.reshape(offsets.shape[1:] * 2) + product(w * offsets.T, offsets))
 
     def normalised(self) -> GaussianMixture:
-        """The same mixture with weights that sum to 1.
+        """Returns the mixture with weights that sum to 1.
 
         Raises:
             ValueError: there is no component, or all weights are zero.
@@ -149,7 +153,7 @@ class GaussianMixture:
         return GaussianMixture(self.weights / total, self.means, self.covariances)
 
     def sorted(self) -> GaussianMixture:
-        """The same mixture, heaviest component first (ties keep their order)."""
+        """Sorts the components, heaviest first (ties keep their order)."""
         return self[np.argsort(-self.weights, kind='stable')]
 
     def __getitem__(self, index: Any) -> GaussianMixture:

@@ -1,13 +1,13 @@
-"""The chain of a filter's modes: weights and paths given later images.
+"""Markov chain of a filter's modes: weights and paths given later images.
 
     W_T(k) = w_k                                                        the newest image T  (1)
     W_t(j) = sum_k W_(t+1)(k) P(j | k)                                  t < T               (2)
     p(k_1 .. k_T | all images) = w_(k_T) prod_t P(k_t | k_(t+1))                            (3)
 
-This is the backward half of forward filtering, backward smoothing [Doucet, Godsill and Andrieu,
-2000]. The evidence of an image for a mode is a factor of w_k alone: it cancels in P(j | k), the
-probability that mode k continues mode j of the image before, and reaches image t by (1) and (2). So
-(2) and (3) are exact for the filter's own chain, and add no parameters.
+This is the backward pass of forward filtering, backward smoothing [Doucet, Godsill and Andrieu,
+2000]. P(j | k) is the probability that mode k continues mode j of the previous image. The evidence
+of an image for a mode is a factor of w_k only: it cancels in P(j | k), and reaches image t by (1)
+and (2). So (2) and (3) are exact for the filter's own chain, and add no parameters.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from hmt_ros.inference.linear_algebra import product
 
 
 class Link(NamedTuple):
-    """The modes of an image in the chain.
+    """Modes of an image in the chain.
 
     Attributes:
-        weights: (K,) posterior probabilities given this image and those before.
-        origins: (K, M) probability that each mode continues each of the M modes of the image
-            before; rows sum to 1. M is 0 at the start of the chain.
+        weights: (K,) posterior probabilities given this image and earlier ones.
+        origins: (K, M) probability that mode k continues mode m of the previous image; rows sum to
+            1. M is 0 at the start of the chain.
     """
 
     weights: Array
@@ -43,12 +43,12 @@ def backward_weights(links: Sequence[Link]) -> list[Array]:
 
 
 def drawn_paths(links: Sequence[Link], count: int, seed: int) -> tuple[Index, Array]:
-    """Draw paths from (3), which share the weight of their first mode given all images.
+    """Draw paths from (3); paths with the same first mode share its smoothed weight.
 
     Paths are drawn forwards, with P(k | j) = W_(t+1)(k) P(j | k) / W_t(j). Each mode of the oldest
-    image with positive weight starts at least one path and keeps its weight (2) exactly, however
-    small it is. Paths through one mode are distributed over its successors by systematic sampling
-    in a random order.
+    image with a positive weight (2) starts at least one path, and its paths have this weight
+    exactly. Paths through one mode are distributed over its successors by systematic sampling in a
+    random order.
 
     Args:
         count: approximate number of paths.
@@ -78,13 +78,13 @@ def drawn_paths(links: Sequence[Link], count: int, seed: int) -> tuple[Index, Ar
 
 
 def reachable_origins(away: Array, weights: Array, reach: float) -> Array:
-    """Return origins (K, M) of modes of unknown ancestry: all modes within reach.
+    """Return origins (K, M) of modes of unknown ancestry: previous modes within reach.
 
     Args:
-        away: (K, M) distances from the modes of the image before, m.
-        weights: (M,) of the modes of the image before.
+        away: (K, M) distances from the modes of the previous image, m.
+        weights: (M,) weights of the modes of the previous image.
         reach: maximum distance of motion between the images, m; without a mode within reach, all
-            count.
+            modes are used.
     """
     near = (away <= reach) * weights
     lost = ~near.any(1)

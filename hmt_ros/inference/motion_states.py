@@ -1,13 +1,13 @@
-"""States of modes, poses with velocities: predicted, and conditioned on the fitted poses.
+"""States of modes, that is poses and velocities: predicted, then conditioned on fitted poses.
 
-A mode's pose x and velocity v have one Gaussian. An image shows only x: when it has been found
-at x* with the covariance P*, the prediction N((x, v), P) is conditioned on it,
+A mode's pose x and velocity v have a joint Gaussian. An image shows only x: after a fit at x* with
+the covariance P*, the prediction N((x, v), P) is conditioned on x*,
 
     G = P_vx P_xx^-1,    v* = v + G (x* - x),    P*_vv = P_vv - G P_xv + G P* G',    P*_vx = G P*
 
-which is the Kalman filter where the energy of the image is quadratic. If a limb has jumped, its
-displacement is no motion, and its velocity is then unknown. Its new position is as uncertain as
-after a random walk at the rates of the body; this also is the search range of jumps.
+which is the Kalman filter if the energy of the image is quadratic. If a limb has jumped, its
+displacement is no motion, so its velocity is unknown. Its position is as uncertain as after a
+random walk at the rates of the body; this is also the search range of jumps.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hmt_ros.core import correct_states, fuse, widen_precisions
 from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 
-# Variance of a variable that jumped, practically infinite, rad^2 or m^2.
+# Variance of the prediction of a jumped variable, practically infinite, rad^2 or m^2.
 UNKNOWN_VARIANCE = 1e6
 
 
@@ -31,9 +31,9 @@ class PredictedStates:
 
     Attributes:
         dynamics: dynamics of the prediction.
-        means: (K, n); the first d are the pose, which may lie beyond the limits of the body.
-        covariances: (K, n, n).
-        wandered: (d,) additional variances for jumps; zeros for random walks, whose variances
+        means: (K, n) means; the first d variables are the pose, possibly beyond the body's limits.
+        covariances: (K, n, n) covariances of the states.
+        wandered: (d,) additional variances for jumps; zero for random walks, whose variances
             suffice.
     """
 
@@ -55,7 +55,7 @@ class PredictedStates:
 
     @property
     def searched(self) -> Array:
-        """Covariances (K, d, d) of the search for jumps."""
+        """Covariances (K, d, d) of poses for the search of jumps."""
         return self.pose_covariances + np.diag(self.wandered)
 
     def covariances_of(self, ancestors: Index, jumped: Mask) -> Array:
@@ -66,7 +66,7 @@ class PredictedStates:
         return result
 
     def precisions_of(self, ancestors: Index, jumped: Mask, precisions: Array) -> Array:
-        """Inverses (N, d, d) of `covariances_of`, given those of the modes (K, d, d)."""
+        """Inverses (N, d, d) of `covariances_of`, given the precisions (K, d, d) of the modes."""
         result = np.empty((len(ancestors), *precisions.shape[1:]))
         widen_precisions(precisions, ancestors, jumped, self.wandered, result)
         return result
@@ -74,13 +74,13 @@ class PredictedStates:
     def given(
         self, ancestors: Index, jumped: Mask, poses: Array, found: Array
     ) -> tuple[Array, Array]:
-        """Return velocities (N, d) and covariances (N, n, n) of states given their poses.
+        """Condition states on poses; return velocities (N, d) and covariances (N, n, n).
 
         Args:
-            ancestors: (N,) mode that each was predicted from.
+            ancestors: (N,) mode from which each state was predicted.
             jumped: (N, d) whether a degree of freedom jumped instead of moving.
-            poses: (N, d) the poses.
-            found: (N, d, d) their covariances.
+            poses: (N, d) fitted poses.
+            found: (N, d, d) covariances of the fitted poses.
         """
         (count, d), n = poses.shape, self.dynamics.state_dimension
         if n == d:
@@ -94,12 +94,12 @@ class PredictedStates:
 
 
 class Predicted(NamedTuple):
-    """States of modes with velocities, for the core.
+    """Predicted states with velocities, as input for the compiled functions.
 
     Attributes:
-        means, covariances: (K, 2 d), (K, 2 d, 2 d).
-        unknown_variance: `UNKNOWN_VARIANCE`.
-        unknown_velocity: (d, d) covariance of the velocity of what jumped.
+        means, covariances: means (K, 2 d) and covariances (K, 2 d, 2 d).
+        unknown_variance: value of `UNKNOWN_VARIANCE`.
+        unknown_velocity: (d, d) covariance of the velocity of jumped variables.
     """
 
     means: Array
@@ -109,7 +109,7 @@ class Predicted(NamedTuple):
 
 
 def fused(a: Array, b: Array) -> Array:
-    """Return covariances (N, d, d) of products of Gaussians with covariances (N, d, d)."""
+    """Return covariances (N, d, d) of products of two Gaussians with covariances (N, d, d)."""
     result = np.empty(a.shape)
     fuse(np.ascontiguousarray(a), np.ascontiguousarray(b), result)
     return result

@@ -1,4 +1,4 @@
-"""Random numbers with the same bytes on every processor."""
+"""Random numbers that are bit-identical on every processor."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import numpy as np
 
 from hmt_ros.inference.arrays import Array
 
-# End of the ziggurat of numpy's normals. Numbers beyond use the logarithm of the C library, which
-# depends on the processor.
+# End of the ziggurat of numpy's normal numbers. Beyond it, numpy calls the logarithm of the C
+# library, which depends on the processor.
 _END = 3.6541528853610088
 
 
 def standard_normals(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
-    """Draw standard normal numbers, clipped at `_END`, which affects three in 10 000."""
+    """Draw standard normal numbers, clipped at +-`_END`, which affects 3 of 10 000."""
     return np.clip(rng.standard_normal(shape), -_END, _END)

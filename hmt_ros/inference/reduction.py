@@ -1,20 +1,20 @@
-"""Reduction of mixtures to fewer components that approximate the same density.
+"""Reduction of mixtures to fewer components with approximately the same density.
 
 Components are merged into one Gaussian with their weight, mean and covariance,
 
     w = sum_i w_i,   m = sum_i w_i m_i / w,   S = sum_i w_i (S_i + (m_i - m) (m_i - m)') / w,
 
 so that the mean and the covariance of the whole mixture are preserved. The functions differ in the
-choice of components:
+choice of the components to merge:
 
-- `merged_pairwise`: the pair that costs least by the upper bound on the Kullback-Leibler divergence
-  that its merge causes [Runnalls, IEEE TAES 2007], until few are left,
+- `merged_pairwise`: the pair of least cost, an upper bound on the Kullback-Leibler divergence due
+  to its merge [Runnalls, IEEE TAES 2007], until few components are left,
 
       B(i, j) = 1/2 ((w_i + w_j) log|S_ij| - w_i log|S_i| - w_j log|S_j|);
 
-- `merged_if_close`: the closest pair, until no pair is closer than a distance;
-- `reduced`: clusters of means, refined to lower a bound on the divergence from the large mixture to
-  the small one [Goldberger and Roweis, NIPS 2004].
+- `merged_if_close`: the closest pair, until no pair is closer than a given distance;
+- `reduced`: clusters of means, refined to lower a bound on the divergence between the large mixture
+  and the small one [Goldberger and Roweis, NIPS 2004].
 """
 
 from __future__ import annotations
@@ -39,10 +39,11 @@ NEGLIGIBLE = 1e-8
 
 
 def merged(mixture: GaussianMixture, share: Array) -> GaussianMixture:
-    """Merge components to new ones with the same moments.
+    """Merge components into new ones with the same moments.
 
     Args:
-        share: (K, B) share of each component in each of B new ones; empty new ones are left out.
+        share: (K, B) share of each component that each of B new components gets; empty ones are
+            left out.
     """
     mass = share * mixture.weights[:, None]
     total = mass.sum(0)
@@ -59,10 +60,17 @@ def merged(mixture: GaussianMixture, share: Array) -> GaussianMixture:
 
 
 def merged_pairwise(mixture: GaussianMixture, count: int) -> GaussianMixture:
-    """Reduce to at most `count` components, by merging the pair of least cost.
+    """Reduce to at most `count` components, by repeatedly merging the pair of least cost.
 
     Raises:
         ValueError: count < 1.
+
+    Example:
+        The merged component keeps the mean and the covariance of both.
+
+        >>> two = GaussianMixture([0.5, 0.5], [[-1.0], [1.0]], [[[0.25]], [[0.25]]])
+        >>> merged_pairwise(two, 1).covariances
+        array([[[1.25]]])
     """
     if count < 1:
         raise ValueError(f'k must be at least 1, saw {count}')
@@ -70,7 +78,7 @@ def merged_pairwise(mixture: GaussianMixture, count: int) -> GaussianMixture:
 
 
 def merged_if_close(mixture: GaussianMixture, distance: float) -> GaussianMixture:
-    """Merge components, the closest first, until no pair is closer than a distance.
+    """Merge the closest components until no pair is closer than a distance.
 
     Args:
         distance: distance of means, in standard deviations of the average of both covariances.
@@ -78,14 +86,14 @@ def merged_if_close(mixture: GaussianMixture, distance: float) -> GaussianMixtur
     return _merged_pairs(mixture, _squared_distances, lambda _, cost: cost < distance**2)
 
 
-# cost(weights, means, covariances, log determinants, pairs (P, 2)) of merging each pair, (P,)
+# Function of weights, means, covariances, log determinants and pairs (P, 2): cost (P,) of merges.
 PairCosts = Callable[[Array, Array, Array, Array, Index], Array]
 
 
 def _merged_pairs(
     mixture: GaussianMixture, cost: PairCosts, go_on: Callable[[int, float], bool]
 ) -> GaussianMixture:
-    """Merge the pair of least cost while `go_on` of the remaining number and this cost is true."""
+    """Merge the pair of least cost while go_on(number of components, least cost) is true."""
     mixture = mixture[mixture.weights > 0] if (mixture.weights == 0).any() else mixture
     w, m, s = (np.array(x) for x in (mixture.weights, mixture.means, mixture.covariances))
     count = len(w)
@@ -111,7 +119,7 @@ def _merged_pairs(
 
 
 def _pair_moments(w: Array, m: Array, s: Array, i: int, j: int) -> tuple[float, Array, Array]:
-    """Return weight, mean and covariance of the components i and j together."""
+    """Return weight, mean and covariance of components i and j merged."""
     total = w[i] + w[j]
     a, b = w[i] / total, w[j] / total
     offset = m[j] - m[i]
@@ -128,9 +136,9 @@ def _squared_distances(w: Array, m: Array, s: Array, log_det: Array, pairs: Inde
 
 
 def reduced(mixture: GaussianMixture, count: int, iterations: int = 10) -> GaussianMixture:
-    """At most `count` components: clusters of means, then descent of the bound of `assignment`.
+    """Reduce to at most `count` components: cluster means, then lower the bound of `assignment`.
 
-    Where pairwise merging gives a lower bound than the clusters, the descent starts from it.
+    If pairwise merging has a lower bound than the clusters, the descent starts from its result.
 
     Raises:
         ValueError: count < 1.
@@ -157,7 +165,7 @@ def reduced(mixture: GaussianMixture, count: int, iterations: int = 10) -> Gauss
 
 
 def clustered(mixture: GaussianMixture, count: int, iterations: int = 20) -> GaussianMixture:
-    """Components merged by clusters of their means, in the metric of the mean covariance."""
+    """Merge components by clusters of their means, in the metric of the mean covariance."""
     shares, d = mixture.weights / mixture.weights.sum(), mixture.dimension
     average = product(shares, mixture.covariances.reshape(len(mixture), -1)).reshape(d, d)
     points = solve_triangular(cholesky(average), mixture.means.T).T
@@ -181,11 +189,11 @@ def clustered(mixture: GaussianMixture, count: int, iterations: int = 20) -> Gau
 
 
 def assignment(large: GaussianMixture, small: GaussianMixture) -> tuple[float, Array]:
-    """A bound on the divergence, nats, and which large component goes to which small one.
+    """Bound on the divergence, nats, and assignment of large components to small ones.
 
-    sum_a w_a min_b KL(large_a || small_b) >= KL(large || small) where the weight of each small
-    component is the sum of those that it stands for, as `merged` leaves them [Goldberger & Roweis,
-    NIPS 2004]; the shares (A, B) are 0 or 1.
+    sum_a w_a min_b KL(large_a || small_b) >= KL(large || small) if the weight of each small
+    component is the sum of the weights assigned to it, as after `merged` [Goldberger & Roweis, NIPS
+    2004]. The shares (A, B) are 0 or 1.
     """
     divergences = gaussian_divergences(large, small)
     share = np.zeros_like(divergences)
@@ -194,7 +202,7 @@ def assignment(large: GaussianMixture, small: GaussianMixture) -> tuple[float, A
 
 
 def gaussian_divergences(a: GaussianMixture, b: GaussianMixture) -> Array:
-    """KL(a_i || b_j), (A, B), between components."""
+    """KL(a_i || b_j), (A, B), between the components of two mixtures."""
     inverses = inverse(b.covariances)
     trace = product(a.covariances.reshape(len(a), -1), inverses.reshape(len(b), -1).T)
     offsets = a.means - b.means[:, None]

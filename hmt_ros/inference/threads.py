@@ -1,7 +1,7 @@
-"""Work shared among threads, in calls that release the interpreter lock, with unchanged results.
+"""Distribution of work among threads, for calls that release the interpreter lock.
 
-Each piece is computed independently and keeps its place, so results do not depend on the number of
-threads.
+Each piece is computed independently and stored at its own place, so results do not depend on the
+number of threads.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
-# Maximum number of threads, for any number of cores.
+# Maximum number of threads.
 MOST_THREADS = 8
 _most = MOST_THREADS
 
@@ -27,13 +27,13 @@ def limit_threads(count: int) -> None:
 def in_threads(
     work: Callable[[int, int], None], count: int, least: int = 4, threads: int = 0
 ) -> None:
-    """Shares poses among threads.
+    """Distributes items among threads.
 
     Args:
-        work: on the poses from one number up to another.
-        least: minimum number of poses per thread.
+        work: function that processes the items from a first index up to an end index.
+        least: minimum number of items per thread.
         threads: maximum number of threads; 0: one per core, up to `MOST_THREADS`, with one core
-            left for a camera, a smoother and subscribers.
+            left for other processes such as a camera or a smoother.
     """
     threads = min(threads or _cores(), _most, count // least)
     if threads < 2:
@@ -47,10 +47,10 @@ def in_threads(
 
 
 def together(calls: Sequence[Callable[[], Any]], threads: int = 0) -> list[Any]:
-    """Return the results of calls, shared among threads as in `in_threads`.
+    """Return the results of calls that are distributed among threads as in `in_threads`.
 
     Args:
-        calls: functions that call neither this nor `in_threads`.
+        calls: functions that call neither `together` nor `in_threads`.
     """
     results: list[Any] = [None] * len(calls)
 
@@ -67,7 +67,7 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(MOST_THREADS, thread_name_prefix='hmt_ros')
 
 
-# A forked child inherits the pool, but none of its threads.
+# A forked child process inherits the pool without its threads.
 os.register_at_fork(after_in_child=_pool.cache_clear)
 
 

@@ -4,11 +4,11 @@
     ros2 run hmt_ros camera_node walk.mp4 --calibration camera.yaml --ros-args -r __ns:=/camera
     ros2 run hmt_ros camera_node walk.mp4 --ros-args -p loop:=true -p rate:=0.5
 
-It publishes `image_raw` and `camera_info`, as sensor data. The stamp of an image is the time at
-which it was read, or is due in the file. Where nothing tells the field of view it is taken to be
-that of a common camera. A device that is unplugged is opened again as soon as it is back. A file
-begins once the nodes of the parameter `wait_for` are active or, without names, once somebody
-subscribes to its images; the node ends with it.
+It publishes `image_raw` and `camera_info` with the sensor data QoS. The stamp of an image is the
+time at which it was read or, in a file, is due. Without a calibration or a field of view that of a
+common camera is assumed. An unplugged device is opened again as soon as it is back. A file starts
+once the nodes in the parameter `wait_for` are active or, if it is empty, once somebody subscribes
+to the images; the node ends with the file.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ NAME = 'camera_node'
 FRAME_ID = 'camera_optical_frame'
 # Assumed image rate of a file that does not give it, 1/s.
 _USUAL_RATE = 30.0
-# Time without an image after which a device counts as unplugged, and interval of attempts to open
-# it, s.
+# Time without an image after which a device counts as unplugged, and interval between attempts to
+# open it again, s.
 _PATIENCE, _REOPENED = 5.0, 1.0
 _GLANCE, _CONNECTING = 0.05, 0.5
 # Time limit for an active node to be discovered as subscriber, s: participants announce themselves
 # every 3 s.
 _SUBSCRIBING = 5.0
-# Interval between reports of nodes that are not active yet, s.
+# Interval between reports on nodes that are not active yet, s.
 _AGAIN = 10.0
 
 
@@ -83,13 +83,13 @@ class Video:
 
     Args:
         source: '/dev/video0', the number of a device, or the path of a file.
-        loop, speed: of a file, see `CameraNodeParameters`.
+        loop, speed: values of `loop` and `rate` for a file, see `CameraNodeParameters`.
 
     Attributes:
         is_file: whether the source is a file.
 
     Raises:
-        ValueError: the source can not be opened; one line.
+        ValueError: the source can not be opened or used; one line.
     """
 
     def __init__(self, source: str, *, loop: bool = False, speed: float = 1.0) -> None:
@@ -101,12 +101,14 @@ class Video:
         self._device = -1 if self.is_file else int(number)
         self._capture = open_video(Path(source)) if self.is_file else cv2.VideoCapture(self._device)
         if not self._capture.isOpened():
-            raise ValueError(f'{source} can not be opened; wanted a webcam that nobody uses')
+            raise ValueError(
+                f'{source} can not be opened; wanted a webcam that no other program uses'
+            )
         if self.is_file and is_mirrored(display_matrix(Path(source)) or STORED):
             # OpenCV would turn mirrored images by 180 degrees.
             raise ValueError(
-                f'{source}: its metadata mirror the images; write them as players show them, by '
-                f'ffmpeg -i {source} shown.mp4'
+                f'{source}: its metadata mirror the images; convert it with ffmpeg -i {source} '
+                'shown.mp4'
             )
         rate = float(self._capture.get(cv2.CAP_PROP_FPS))
         self._rate = rate if math.isfinite(rate) and rate > 0.0 else _USUAL_RATE
@@ -114,11 +116,11 @@ class Video:
     def images(
         self, stopped: threading.Event, warn: Callable[[str], Any]
     ) -> Iterator[tuple[Image, int | None]]:
-        """Images (H, W, 3) BGR, with their times in a file after its first image, ns.
+        """Images (H, W, 3) BGR, each with its time since the first image of a file, ns, or None.
 
         Args:
-            stopped: ends the iteration.
-            warn: receives a line when a device is unplugged, and when it is back.
+            stopped: event that ends the iteration.
+            warn: function that receives a line when a device is unplugged, and when it is back.
         """
         start, number, seen, again, gone = time.monotonic(), 0, time.monotonic(), 0, False
         while not stopped.is_set():
@@ -141,8 +143,9 @@ class Video:
             elif time.monotonic() - seen > _PATIENCE:
                 if not gone:
                     warn(
-                        f'{self._source} has given no image for {_PATIENCE:g} s: is it plugged in, '
-                        'and does nobody else use it? It goes on as soon as it is back'
+                        f'{self._source} has given no image for {_PATIENCE:g} s: is it plugged '
+                        'in, and not used by another program? The node continues as soon as it '
+                        'is back'
                     )
                     gone = True
                 self._capture.release()
@@ -197,7 +200,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar='FILE',
         help='calibration file, as import-video --camera takes it',
     )
-    parser.add_argument('--frame-id', default=FRAME_ID, help=f'of the images ({FRAME_ID})')
+    parser.add_argument('--frame-id', default=FRAME_ID, help=f'frame_id of the images ({FRAME_ID})')
     return parser
 
 
@@ -277,14 +280,14 @@ def _show(
 
 
 def _camera(node: Any, given: argparse.Namespace, size: tuple[int, int]) -> Camera:
-    """The calibrated camera; warns if a usual field of view is assumed."""
+    """The camera by calibration or field of view; warns if the field of view is assumed."""
     if given.calibration is not None:
         return read_camera(given.calibration, size, node.get_logger().warn)
     if given.fov is None:
         node.get_logger().warn(
-            f'neither --calibration nor --fov is given: the field of view is taken to be '
-            f'{USUAL_FOV:g} degrees along the longer side; distances are wrong by as much as '
-            'that is, see focal_length_sigma of filter_node'
+            'neither --calibration nor --fov is given: the field of view is assumed to be '
+            f'{USUAL_FOV:g} degrees along the longer side; distances have the relative error of '
+            'the focal length, see focal_length_sigma of filter_node'
         )
         return usual_camera(size)
     return camera_of_view(size, horizontal=given.fov)

@@ -27,12 +27,12 @@ class Rates:
     """Rates in the last period of the diagnostics.
 
     Args:
-        name: of the counted messages, such as 'images'.
-        done: name of the used messages, such as 'tracked'.
+        name: plural name of the counted messages, such as 'images'.
+        done: name of the count of used messages, such as 'tracked'.
 
     Attributes:
-        name: of the messages.
-        change: of the counts in the period.
+        name: plural name of the counted messages.
+        change: changes of the counts in the last period.
         computing: text on the computing time of a message.
     """
 
@@ -48,7 +48,8 @@ class Rates:
         """Ends a period.
 
         Args:
-            counts: 'received', 'dropped', 'faults', 'lost' and used messages, since the start.
+            counts: numbers of 'received', 'dropped', 'lost' and used messages, and of 'faults',
+                since the start.
         """
         now = time.monotonic()
         self._seconds, self._began = max(now - self._began, 1e-3), now
@@ -93,7 +94,7 @@ class Rates:
 
 
 def trouble_of_period(state: SessionState, rates: Rates, silent: SilentTopics) -> str:
-    """Text on the trouble of the last period, with its cause; '' without trouble."""
+    """Text on the problem of the last period, with its cause; '' without a problem."""
     name, why = rates.name, '; '.join(silent.texts.values())
     if rates.change['dropped']:
         held_up = f'waits for {state.held_up}' if state.held_up else rates.computing
@@ -110,15 +111,15 @@ def trouble_of_period(state: SessionState, rates: Rates, silent: SilentTopics) -
 
 
 class MiddlewareEvents:
-    """Counts lost messages and incompatible partners, and warns of the first of each kind.
+    """Counts lost messages and incompatible publishers and subscriptions; warns once per kind.
 
-    Callbacks and `forget` are for the executor's thread, other methods for any thread.
+    Only the executor's thread may call callbacks and `forget`; other methods are thread-safe.
     """
 
     def __init__(self, warn: Callable[[str], None]) -> None:
         self._warn = warn
         self._counts: Counter[str] = Counter()
-        # Differing policy of the last incompatible partner, by kind of partner and topic.
+        # QoS policy in which the last incompatible publisher or subscription differs, by topic.
         self._policies: dict[str, str] = {}
 
     def of_subscription(self, topic: str) -> SubscriptionEventCallbacks:
@@ -150,7 +151,7 @@ class MiddlewareEvents:
     def _misfits(
         self, topic: str, partners: str, words: tuple[str, str, str], effect: str
     ) -> dict[str, Callable[[Any], None]]:
-        """Callbacks for partners of another quality of service, or of another type."""
+        """Callbacks for publishers or subscriptions with another QoS policy or message type."""
         wants, than, has = words
 
         def incompatible(event: Any) -> None:
@@ -197,7 +198,7 @@ class MiddlewareEvents:
 
     def _count(self, what: str, count: int, text: str) -> None:
         if what not in self._counts:
-            self._warn(f'{text} (more of the kind are counted in /diagnostics)')
+            self._warn(f'{text} (more of this kind are counted in /diagnostics)')
         self._counts[what] += count
 
 

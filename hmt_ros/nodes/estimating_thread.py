@@ -1,8 +1,8 @@
 """The estimating threads: they pass messages to the sessions of a process.
 
 Each session has a bounded queue of messages, in the order of their arrival. A session reads all
-waiting messages before it estimates again, so that a late node continues with the newest image for
-which all other inputs are there. Only older images are dropped.
+waiting messages before it estimates again, so that a late node continues with the newest image
+whose other inputs have all arrived. Only older images are dropped.
 
 The sessions that contribute to a pose share one thread and take turns, in the order in which they
 use each other's results. Sessions that can wait for the pose have a second thread, which handles a
@@ -30,26 +30,26 @@ from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.headers import stamp_in
 from msg_tools.messages.images import decode_image
 
-# Longest time that a message waits for the other thread, s.
+# Maximum time that a message of the second thread waits for the first thread to be idle, s.
 LONGEST_WAIT = 0.1
-# Number of newest decoded images that the sessions of a process share.
+# Number of recently decoded images that the sessions of a process share.
 SHARED = 4
 _RESTART = 'restart'
-# Number of newest dropped images that are reported one by one; the others are only counted.
+# Maximum number of recently dropped images that are reported singly; others are only counted.
 _ANSWERED = 100
-# Maximum number of arrival times that are kept until the estimate of their image.
+# Maximum number of images whose arrival times are remembered, to measure the latency.
 _REMEMBERED = 1000
 
 
 class Waiting(NamedTuple):
-    """A message or a request that waits.
+    """A waiting message or request.
 
     Attributes:
-        source: its origin.
-        content: function that reads the message, or raises any Exception if it is unreadable; or
-            that executes the request.
+        source: source of the message, or kind of the request.
+        content: function that reads the message, or raises any Exception if it is unreadable; for
+            a request, function that executes it.
         arrival: time of arrival by a monotonic clock, s.
-        stamp_ns: of its header; 0 where it has none.
+        stamp_ns: stamp in the header of the message, ns; 0 without a header.
     """
 
     source: str
@@ -59,10 +59,10 @@ class Waiting(NamedTuple):
 
 
 def received(data: bytes, of: SubscribedTopic) -> Waiting:
-    """A message that arrived now; it is read at most once for all sessions."""
+    """Return a message that has just arrived; it is read at most once for all sessions."""
     read: Callable[[], Any] = cache(partial(deserialise, data, of.msgtype))
     if len(data) > of.largest:
-        # Free its memory.
+        # Does not keep the oversized message in memory.
         read = partial(_refuse, f'it has {len(data)} bytes, the limit is {of.largest}')
     stamp = stamp_in(data) if opens_with_header(of.msgtype) else 0
     return Waiting(of.source, read, time.monotonic(), stamp)
@@ -76,8 +76,8 @@ class Duration(NamedTuple):
     """Times that an estimate took.
 
     Attributes:
-        latency: from the arrival of its message, s.
-        whole: from reading its message to publishing the last result, s.
+        latency: time from the arrival of the image or other message to the last result, s.
+        whole: time from reading the message to publishing the last result, s.
         publishing: part of `whole` for serialising and publishing, s.
     """
 
@@ -104,10 +104,10 @@ class InputQueue:
     """First-in-first-out queue between threads.
 
     Args:
-        limits: maximum number of waiting messages by source or kind of source; others are
-            unlimited.
+        limits: maximum number of waiting messages by source or kind of source; sources without an
+            entry are unlimited.
         counted: kind of source whose dropped messages are counted.
-        changed: notified on each arrival; its lock guards the queue.
+        changed: condition that is notified on each arrival; its lock guards the queue.
     """
 
     def __init__(
@@ -123,12 +123,12 @@ class InputQueue:
         self._changed = changed or threading.Condition()
 
     def limit(self, source: str, most: int) -> None:
-        """Sets the maximum number of waiting messages of a source, or of each of a kind."""
+        """Sets the maximum number of waiting messages of a source, or of each source of a kind."""
         with self._changed:
             self._limits[source] = most
 
     def put(self, waiting: Waiting) -> None:
-        """Adds a message or request; drops the oldest of its source above the limit."""
+        """Adds a message or request; above the limit of its source, drops the oldest one."""
         source = waiting.source
         with self._changed:
             if self._closed:
@@ -158,7 +158,7 @@ class InputQueue:
             return result
 
     def close(self) -> Arrived:
-        """Closes the queue to new messages; returns those that wait."""
+        """Closes the queue to new messages; returns the waiting ones."""
         with self._changed:
             self._closed = True
             return self.take()
@@ -175,13 +175,13 @@ class InputQueue:
 
 
 class EstimatingThread:
-    """A thread that gives turns to the estimators that it serves.
+    """A thread that runs several estimators in turn.
 
-    The public methods are for all other threads.
+    The public methods may be called by any other thread.
 
     Args:
         changed: condition shared by all estimating threads of the process and their queues.
-        after: thread of higher priority.
+        after: thread of higher priority; None: no such thread.
     """
 
     def __init__(self, changed: threading.Condition, after: EstimatingThread | None = None) -> None:
@@ -192,7 +192,7 @@ class EstimatingThread:
         self._thread: threading.Thread | None = None
 
     def serve(self, estimator: Estimator) -> None:
-        """Starts to give turns to an estimator."""
+        """Adds an estimator, which gets turns from now on."""
         with self.changed:
             self._served.append(estimator)
             self._served.sort(key=lambda one: one.place)
@@ -201,7 +201,7 @@ class EstimatingThread:
                 self._thread.start()
 
     def leave(self, estimator: Estimator, timeout: float | None) -> bool:
-        """Gives no more turns to an estimator; returns whether its turn ends within `timeout` s."""
+        """Removes an estimator; returns whether its present turn ends within `timeout` s."""
         with self.changed:
             if estimator in self._served:
                 self._served.remove(estimator)
@@ -215,7 +215,11 @@ class EstimatingThread:
             estimator.handle(estimator.queue.take(None if self._after is None else 1))
 
     def _next(self, last: int) -> Estimator | None:
-        """Waits for the next estimator with work after a place; None if none is served."""
+        """Waits until an estimator has work, and returns it; None if there are no estimators.
+
+        Args:
+            last: place of the estimator that had the last turn; the next place has priority.
+        """
         with self.changed:
             self._busy = None
             self.changed.notify_all()
@@ -263,18 +267,19 @@ class EstimatingThreads:
 class Estimator:
     """Handles the messages of a session, and reports on each.
 
-    All methods but `handle` may be called by any thread.
+    All methods except `handle` are thread-safe.
 
     Args:
-        session: used only by the thread, until `stop` has returned True.
-        thread: that gives it its turns.
-        place: position of its turns among those of others.
-        tell: receives the report on each message.
-        tell_change: called when status or kinds of faults of the session have changed.
-        tell_error: receives an unexpected error of the session; returns a line that names it.
+        session: session to run; only the thread uses it, until `stop` has returned True.
+        thread: thread that runs the estimator.
+        place: rank of the estimator in the order in which the thread gives turns.
+        tell: function that receives the report on each message.
+        tell_change: function that is called when status or kinds of faults of the session change.
+        tell_error: function that receives an unexpected error of the session, and returns a line
+            that names it.
 
     Attributes:
-        queue: messages and requests that wait.
+        queue: waiting messages and requests.
     """
 
     def __init__(
@@ -289,7 +294,7 @@ class Estimator:
     ) -> None:
         self._session, self._thread = session, thread
         self.place = place
-        # Of several requests to restart, the last one counts.
+        # Only the last of several waiting restart requests is executed.
         limits = {_RESTART: 1, session.COUNTED: session.most_waiting}
         self.queue = InputQueue(limits, session.COUNTED, thread.changed)
         session.interrupted = lambda: bool(len(self.queue))
@@ -304,15 +309,15 @@ class Estimator:
             self.queue.limit(one.source, one.waiting)
 
     def restart(self, action: Callable[[], None]) -> None:
-        """Restarts the session by an action, after all messages that wait."""
+        """Queues an action that restarts the session, after all waiting messages."""
         self.queue.put(Waiting(_RESTART, action, time.monotonic()))
 
     def take_limit(self) -> None:
-        """Updates the maximum number of waiting images or mixtures from the session."""
+        """Sets the limit of waiting images or mixtures to `most_waiting` of the session."""
         self.queue.limit(self._session.COUNTED, self._session.most_waiting)
 
     def take_durations(self) -> list[Duration]:
-        """Times that estimates took since the last call."""
+        """Durations of the estimates since the last call."""
         return [self._durations.popleft() for _ in range(len(self._durations))]
 
     def stop(self, timeout: float | None = None) -> bool:
@@ -372,8 +377,8 @@ class Estimator:
         else:
             handled = session.take(waiting.source, message, more=more)
         if more_done := session.state.counts[session.DONE] - done:
-            # Latency counts from the image, which may have waited for this message. Stamps of
-            # forecasts are in the future.
+            # Latency is measured from the image, which may have waited for this message. Stamps
+            # of forecasts are in the future.
             stamps = (stamp for topic, stamp in handled.published if 'forecast' not in topic)
             newest = max(stamps, default=0)
             arrival = self._arrivals.get(newest, waiting.arrival)

@@ -26,7 +26,7 @@ class FilterNode(TrackingNode):
     DEFAULTS = FilterParameters()
 
     def _in_namespace(self, defaults: FilterParameters) -> FilterParameters:
-        """Prefixes frames by the namespace, so that each person has separate frames."""
+        """Prefixes frames with the namespace, so that each person has separate frames."""
         namespace = self.get_namespace().strip('/')
         return replace(defaults, frame_prefix=f'{namespace}/') if namespace else defaults
 

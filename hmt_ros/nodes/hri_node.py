@@ -106,8 +106,8 @@ class HriNode(SessionNode[HriSession, HriParameters]):
                 continue
             if len(self._heard) >= _MOST_TOPICS:
                 self.get_logger().warn(
-                    f'{_MOST_TOPICS} topics are subscribed to, which is the limit: mixtures in '
-                    f'{namespace} are left out; name those that count in the parameter namespaces',
+                    f'the limit of {_MOST_TOPICS} subscribed topics is reached: mixtures in '
+                    f'{namespace} are ignored; name those to use in the parameter namespaces',
                     once=True,
                 )
                 return
@@ -125,7 +125,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
                 message_class(msgtype),
                 topic,
                 qos,
-                # The executor's thread would call event handlers.
+                # Without event handlers, which the executor's thread would call.
                 event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
             )
         return self._of_bodies[topic]

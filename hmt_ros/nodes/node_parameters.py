@@ -1,4 +1,4 @@
-"""ROS parameters of a node: declaration, and warnings of ineffective values."""
+"""ROS parameters of a node: declaration, and warnings about ineffective values."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from hmt_ros.sessions.parameter_file import LARGEST_FILE, PARAMETERS_KEY
 from msg_tools.files.plain_yaml import read_plain_yaml
 
 QOS_OVERRIDES = 'qos_overrides.'
-# Least similarity of a name to a suggested one; larger for nodes, whose names are alike.
+# Minimum similarity of a name to a suggestion; larger for nodes, whose names are similar.
 _ALIKE, _ALIKE_NODE = 0.5, 0.8
 
 
@@ -42,13 +42,13 @@ def declare(node: Node, defaults: Settings) -> Settings:
     """Declares the parameters of a settings dataclass.
 
     Args:
-        defaults: their default values.
+        defaults: dataclass with the default values.
 
     Returns:
         The values given to the node.
 
     Raises:
-        ValueError: inconsistent values.
+        ValueError: the values are inconsistent.
     """
     declared = declared_parameters(defaults)
     as_in_ros = values_of(defaults)
@@ -57,13 +57,13 @@ def declare(node: Node, defaults: Settings) -> Settings:
     settings = with_values(defaults, values)
     lists = {p.name for p in declared if isinstance(p.default, tuple)}
     node.add_pre_set_parameters_callback(partial(with_empty_lists, names=lists))
-    # ROS passes an empty list of a parameter file as no value, too.
+    # ROS also passes an empty list in a parameter file as an unset value.
     node.set_parameters([Parameter(name) for name in lists if values[name] is None])
     return settings
 
 
 def descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:
-    """The ROS descriptor of a parameter: description, limits, whether it can change."""
+    """The ROS descriptor of a parameter: description, limits, and whether it can change."""
     result = ParameterDescriptor(
         description=f'{parameter.description} {EFFECTS[parameter.effect]}',
         read_only=parameter.effect == AT_LAUNCH,
@@ -82,12 +82,12 @@ def descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:
 
 
 def with_empty_lists(parameters: Iterable[Parameter], names: Set[str]) -> list[Parameter]:
-    """Parameters to set, where list parameters without a value get an empty list.
+    """Parameters to set; list parameters without a value get an empty list.
 
-    ROS tools write an empty list as no value, and rclpy would delete a parameter without a value.
+    ROS tools send an empty list as an unset value, and rclpy would delete an unset parameter.
 
     Args:
-        names: of the parameters that are lists of numbers.
+        names: names of the parameters that are lists of numbers.
     """
     return [
         Parameter(one.name, Parameter.Type.DOUBLE_ARRAY, [])
@@ -114,7 +114,7 @@ def refuse(response: Any, asked: int, reason: str) -> None:
 
 
 def unknown_parameters(given: Iterable[str], known: Iterable[str]) -> list[str]:
-    """Warnings of unknown parameter names, with suggestions.
+    """Warnings about unknown parameter names, with suggestions.
 
     Args:
         given: names from the command line and from parameter files.
@@ -129,10 +129,10 @@ def unknown_parameters(given: Iterable[str], known: Iterable[str]) -> list[str]:
 
 
 def file_folders(given: str) -> tuple[str, ...]:
-    """Folders of the files that parameters of a running node may name.
+    """Folders in which parameters of a running node may name files.
 
     Args:
-        given: the parameter `file_folders`.
+        given: value of the parameter `file_folders`.
     """
     usual = []
     for find in (partial(get_package_share_directory, 'hmt_ros'), Path.home, Path.cwd):
@@ -147,16 +147,16 @@ def file_folders(given: str) -> tuple[str, ...]:
 def next_step(node: Node) -> str:
     """Advice after a failed configuration."""
     change = f'ros2 lifecycle set {node.get_fully_qualified_name()}'
-    return f'mend that, then: {change} configure; {change} activate'
+    return f'fix that, then: {change} configure; {change} activate'
 
 
 def files_for_others(arguments: Iterable[str], node: str) -> list[str]:
-    """Warnings of parameter files whose section has a similar name, but not that of the node.
+    """Warnings about parameter files with a section for a similar name, but none for the node.
 
     A file for other nodes gives no warning: one file may serve many nodes.
 
     Args:
-        node: its full name.
+        node: full name of the node.
     """
     words, texts = list(arguments), []
     for option, path in itertools.pairwise(words):
@@ -165,7 +165,7 @@ def files_for_others(arguments: Iterable[str], node: str) -> list[str]:
         try:
             document = read_plain_yaml(Path(path), LARGEST_FILE)
         except ValueError:
-            # ROS accepted this file, which is valid YAML beyond the plain subset.
+            # ROS accepted this file, so it is valid YAML, but not in the plain subset.
             continue
         sections = list(_sections(document, '')) if isinstance(document, Mapping) else []
         if any(re.fullmatch(_pattern(section), node) for section in sections):
@@ -192,6 +192,6 @@ def _sections(document: Mapping[Any, Any], prefix: str) -> Iterator[str]:
 
 
 def _pattern(section: str) -> str:
-    """Regular expression for the full names of the nodes of a section."""
+    """Regular expression for the full names of the nodes to which a section applies."""
     parts = {'*': '/[^/]+', '**': '(/[^/]+)*'}
     return ''.join(parts.get(part, f'/{re.escape(part)}') for part in section.split('/')[1:])

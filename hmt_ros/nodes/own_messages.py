@@ -1,4 +1,4 @@
-"""Messages that return to their publisher, which subscribes to the same topic."""
+"""Messages that a node receives back because it subscribes to a topic that it publishes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class OwnMessages:
             self._waiting.append(_key(data))
 
     def is_own(self, data: bytes) -> bool:
-        """Whether a received message is an own one; each returns once."""
+        """Whether a received message was sent by this node; each sent message returns once."""
         key = _key(data)
         with self._lock:
             if known := key in self._waiting:

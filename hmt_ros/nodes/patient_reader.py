@@ -1,4 +1,4 @@
-"""Reads files that parameters name in a separate thread, for which a node waits only shortly.
+"""Reads the files of parameters in a separate thread, for which the node waits only briefly.
 
 A Python thread can not be stopped. A slow reader continues in the background, and a repeated
 request gets its result.
@@ -12,8 +12,8 @@ from concurrent.futures import Future, wait
 from threading import Thread
 from typing import Any
 
-# Longest time that a node waits for a reader, s, and largest share of its time, so that many
-# requests do not block it.
+# Maximum time that a node waits for a reader, s, and maximum fraction of its time that it spends
+# waiting, so that many requests do not block it.
 LONGEST_WAIT, SHARE = 0.6, 0.5
 _GLANCE = 0.01
 
@@ -31,17 +31,17 @@ class PatientReader:
         """Reads files.
 
         Args:
-            of: identifies the request; a repeated request has an equal value.
-            action: reads the files.
-            meanwhile: called repeatedly during the wait.
+            of: key of the request; a repeated request has an equal key.
+            action: function that reads the files.
+            meanwhile: function that is called repeatedly during the wait.
 
         Raises:
             ValueError: other files are being read, or these are not read yet; one line.
-            Exception: of the action.
+            Exception: raised by the action.
         """
         if self._asked is None or (self._asked[0] != of and self._asked[1].done()):
             self._asked = of, Future()
-            # Not a pool, whose threads the process would join at its end.
+            # Not a pool, because the process would join its threads at exit.
             Thread(target=_do, args=(action, self._asked[1]), name='read', daemon=True).start()
         asked, result = self._asked
         if asked != of:
@@ -63,5 +63,5 @@ def _do(action: Callable[[], Any], result: Future[None]) -> None:
         action()
         result.set_result(None)
     except Exception as error:  # noqa: BLE001
-        # `Future.result` raises it.
+        # `Future.result` raises this error in the thread that waits.
         result.set_exception(error)

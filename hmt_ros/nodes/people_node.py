@@ -49,7 +49,7 @@ class PeopleNode(TrackingNode):
 
     def _start_asked_for(self, request: Reset.Request) -> TrackStart:
         if len(request.initial.components) or request.box.width:
-            raise ValueError('a mixture or a box is of one person: wanted an empty request')
+            raise ValueError('a mixture or a box is for one person: wanted an empty request')
         return prepare_start(self._settings)
 
     # Called by the estimating thread.
@@ -65,7 +65,7 @@ class PeopleNode(TrackingNode):
             return super()._is_wanted(topic)
 
     def _open(self, topic: str) -> None:
-        """Opens a topic of a person, once; the caller holds the lock."""
+        """Opens a topic of a person if it is not open; the caller must hold the lock."""
         if topic not in self._outputs:
             publisher = self._new_publisher(topic, *published_with(published_topic(topic)))
             publisher.on_activate(None)

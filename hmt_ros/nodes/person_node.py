@@ -25,7 +25,7 @@ NAME = 'person_node'
 NODES: Mapping[str, type[SessionNode[Any, Any]]] = {
     node.NAME: node for node in (FilterNode, SmootherNode, BmeNode, KeypointsNode)
 }
-# In the order of their turns.
+# Nodes in the order in which they take turns.
 _ORDER = (KeypointsNode.NAME, BmeNode.NAME, FilterNode.NAME, SmootherNode.NAME)
 USUAL = (FilterNode.NAME, SmootherNode.NAME, BmeNode.NAME)
 # Interval between two predictions while the filter tracks the person, s.
@@ -36,14 +36,14 @@ _USAGE = f"""usage: ros2 run hmt_ros {NAME} [NODE ...] [--ros-args ...]
 Filter, smoother, experts and a detector in one process.
 
 Each NODE is one of {', '.join(NODES)};
-without any these run: {', '.join(USUAL)}. They have the names, parameters, topics and
-services that they have in processes of their own: see "ros2 run hmt_ros NODE --help".
-The filter uses the predictions of bme_node, and the keypoints of a detector, where these run.
+by default these run: {', '.join(USUAL)}. Their names, parameters, topics and
+services are the same as in separate processes: see "ros2 run hmt_ros NODE --help".
+The filter uses the predictions of bme_node, and the keypoints of a detector, if these run.
 """
 
 
 def used_of_each_other(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Parameters, by node, by which nodes that run together use each other's results."""
+    """Parameter values, by node, that make nodes in one process use each other's results."""
     values: dict[str, dict[str, Any]] = {name: {} for name in names}
     if FilterNode.NAME in names:
         used = {
@@ -62,7 +62,7 @@ def nodes_together(names: Sequence[str], **options: Any) -> list[SessionNode[Any
     """Nodes that share threads and messages, in the order of their turns.
 
     Args:
-        options: of all nodes, see `SessionNode`.
+        options: keyword arguments of all nodes, see `SessionNode`.
     """
     values = used_of_each_other(names)
     nodes: list[SessionNode[Any, Any]] = []

@@ -27,15 +27,15 @@ from hmt_ros.sessions.declared_parameters import DeclaredParameter, declared_par
 from hmt_ros.sessions.parameter_file import yaml_scalar
 from msg_tools.files.error_line import error_line
 
-# Environment variable with the id of the parent process; a node ends with it.
+# Environment variable with the id of the parent process; a node ends when that process ends.
 OWNER = 'HMT_ROS_OWNER'
 
 # Parameter of mallopt(3) for the maximum number of heaps.
 _ARENA_MAX = -8
-# Time after which a thread yields Python's lock to another, s. With the default of 5 ms, beside a
-# busy thread, a step would wait as long after each call of compiled code.
+# Time after which a thread yields Python's lock to another, s. With the default of 5 ms, a busy
+# thread would delay the others by this time after each of their calls of compiled code.
 _SWITCH_INTERVAL = 0.0005
-# Time limit for the last estimate at the end, s.
+# Maximum time that a stopping node waits for its last estimate, s.
 _LAST_ESTIMATE = 5.0
 _WIDTH = 100
 _TYPES = {bool: 'bool', int: 'int', float: 'float', str: 'string', tuple: 'list of floats'}
@@ -56,8 +56,8 @@ def run_together(
     """Runs nodes in this process until a signal stops it; returns 0, or 1 if one could not start.
 
     Args:
-        make: makes the nodes, after ROS is initialised.
-        arguments: of the command line, for ROS.
+        make: function that creates the nodes; called after ROS is initialised.
+        arguments: command-line arguments, which are passed to ROS.
     """
     _use_one_heap()
     # OpenCV's threads wait actively; on camera images they cost more than they save.
@@ -107,9 +107,9 @@ def _use_one_heap() -> None:
 
 
 def _new_executor() -> Executor:
-    """An events executor, which does not search all topics of all nodes for each message.
+    """An events executor; other executors search all topics of all nodes for each message.
 
-    With it a camera gets a quarter more answers. The first releases of Jazzy lack it.
+    It raises the rate of processed images by a quarter. The first releases of Jazzy lack it.
     """
     try:
         from rclpy.experimental import EventsExecutor

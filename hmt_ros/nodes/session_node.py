@@ -84,21 +84,21 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     """A node around a session; its parameters are those of a settings dataclass.
 
     Args:
-        defaults: of the parameters; None: those of the class.
-        beside: another node of this process; None: this is the first.
-        options: of `rclpy.lifecycle.LifecycleNode`.
+        defaults: default values of the parameters; None: `DEFAULTS`.
+        beside: another node of this process, to share its threads; None: this node is the first.
+        options: keyword arguments of `rclpy.lifecycle.LifecycleNode`.
 
     Attributes:
-        NAME: of the node.
-        SUBJECT: subject of the diagnostics.
+        NAME: name of the node.
+        SUBJECT: subject in the name of the diagnostics status, such as 'track'.
         SESSION: class of the session.
         DEFAULTS: parameters with their default values.
-        CAN_WAIT: whether the node may work after the other nodes of the process.
+        CAN_WAIT: whether the other nodes of the process have priority over this one.
     """
 
     NAME: ClassVar[str]
     SUBJECT: ClassVar[str]
-    # Their types are type variables of the class, which a ClassVar can not use.
+    # Any, because ClassVar does not support the type variables of the class.
     SESSION: ClassVar[Any]
     DEFAULTS: ClassVar[Any]
     CAN_WAIT: ClassVar[bool] = False
@@ -112,10 +112,10 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         super().__init__(self.NAME, **options)
         defaults = self._in_namespace(self.DEFAULTS if defaults is None else defaults)
         if self.get_parameter('use_sim_time').value:
-            # A bag may be played repeatedly.
+            # Simulated time jumps back when a bag is played again.
             defaults = replace(defaults, reset_on_time_jump=True)
         self._settings: Parameters = declare(self, defaults)
-        # Only parameters that were set at launch may name files anywhere.
+        # Only parameters that were set at launch may name files in any folder.
         self._at_launch = self._settings
         self._folders = file_folders(self._settings.file_folders)
         self._reader = PatientReader()
@@ -132,21 +132,21 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._threads: EstimatingThreads = (
             EstimatingThreads() if beside is None else beside._threads
         )
-        # The nodes of this process, in the order of their turns.
+        # Nodes of this process, in the order in which they take turns.
         self._nodes: list[SessionNode[Any, Any]] = [] if beside is None else beside._nodes
         self._local_names: dict[str, str] = {}
         offered = (topic for topic in self._offered_topics() if not topic.startswith('/'))
         self._offered_names = {self._local_name(topic) for topic in offered}
-        # Inputs of this node, and subscriptions that it owns, by topic name in this process.
+        # Inputs of this node, and the subscriptions that it owns, by local topic name.
         self._heard: dict[str, SubscribedTopic] = {}
         self._connected: dict[str, Any] = {}
         self._nodes.append(self)
         # Sent messages on topics that the node also subscribes to.
         self._own = OwnMessages()
         self._failure = ''
-        # Effect of a backward jump of the clock, and time of its first report, s.
+        # Report on the last backward jump of the clock, and the time when it was first seen, s.
         self._jump = '', 0.0
-        # Count and text of the node's internal errors.
+        # Number of internal errors of the node, and the text of the last one.
         self._errors, self._last_error = 0, ''
         self._told_at = self._untold = 0
         self._told_status = ''
@@ -166,11 +166,11 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     # Overridden by each node.
 
     def _offered_topics(self) -> Iterable[str]:
-        """Topics that nodes of this process receive from this node only."""
+        """Topics that the node publishes; the nodes of this process receive them directly."""
         return self.SESSION.TOPICS
 
     def _in_namespace(self, defaults: Any) -> Any:
-        """Default values of the parameters in the namespace of the node."""
+        """Default values of the parameters, adapted to the namespace of the node."""
         return defaults
 
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
@@ -179,10 +179,10 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
 
     @abstractmethod
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
-        """The topics to subscribe to, the one that sets the pace last."""
+        """Topics to subscribe to; the messages of the last one trigger estimates."""
 
     def _messages_of_others(self, settings: Parameters) -> Mapping[str, str]:
-        """Message types of optional packages, each with its consumer.
+        """Message types that other packages must provide, each with the name of its user.
 
         Raises:
             ValueError: no suitable package is installed.
@@ -199,7 +199,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             self.trigger_activate()
 
     def stop(self, timeout: float | None = None) -> bool:
-        """Stops the estimator after its present message.
+        """Stops the estimator when its present work is done.
 
         Returns:
             Whether it stopped within `timeout` s.
@@ -213,7 +213,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         """A session with these parameters.
 
         Raises:
-            ValueError: a parameter names something unusable or not installed.
+            ValueError: a parameter names a file or package that is missing or unusable.
         """
         for msgtype, needed_by in self._messages_of_others(settings).items():
             read_installed_messages(msgtype, needed_by)
@@ -296,7 +296,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Deletes the session and closes topics; also at shutdown and after an error."""
+        """Deletes the session and its topics; also called at shutdown and after an error."""
         self._close()
         return super().on_cleanup(state)
 
@@ -310,7 +310,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._connect(name)
 
     def _connect(self, name: str) -> None:
-        """Subscribes to a topic, unless a node of this process offers it or subscribes to it."""
+        """Subscribes to a topic, unless a node of this process publishes or receives it."""
         if any(name in one._offered_names or name in one._connected for one in self._nodes):
             return
         wanted = self._heard[name]
@@ -332,7 +332,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         )
 
     def _leave(self, name: str) -> None:
-        """Leaves a topic; another node of the process that listens subscribes instead."""
+        """Unsubscribes from a topic; the next listening node of the process subscribes to it."""
         del self._heard[name]
         if (subscription := self._connected.pop(name, None)) is None:
             return
@@ -345,7 +345,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return [one for one in self._nodes if name in one._heard]
 
     def _hear(self, name: str, waiting: Waiting) -> None:
-        """Queues a message on a topic; any thread may call this."""
+        """Queues a message of a topic. Thread-safe."""
         wanted, estimator = self._heard.get(name), self._estimator
         if wanted is not None and estimator is not None:
             self._silent.arrived(wanted.source, waiting.arrival)
@@ -369,11 +369,11 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             self.destroy_service(service)
         self._offered.clear()
         self._session = None
-        # Sessions are in reference cycles with images; Python would free them much later.
+        # Reference cycles keep a session and its images alive until the next garbage collection.
         gc.collect()
 
     def _serve(self, callback: Callable[..., Any], request: Any, response: Any) -> Any:
-        """Answers a request; refuses it, with a reason, if it fails."""
+        """Calls the callback of a service; if it fails, refuses the request with the reason."""
         asked = getattr(request, 'parameters', ())
         try:
             if len(asked) > MOST_PARAMETERS:
@@ -392,10 +392,11 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     # Parameters.
 
     def _warn_of_unknown(self, *, qos: bool) -> None:
-        """Warns about values of parameters that the node does not have.
+        """Warns about values given for parameters that the node does not have.
 
         Args:
-            qos: whether to check the QoS overrides, which subscriptions declare, or the others.
+            qos: True checks only the QoS overrides, which subscriptions declare; False checks
+                all other parameters.
         """
         given = [x for x in self._parameter_overrides if x.startswith(QOS_OVERRIDES) == qos]
         for text in unknown_parameters(given, self._parameters):
@@ -423,7 +424,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         """Checks new parameters by reading the files that they name.
 
         Raises:
-            ValueError: a file that can not be used, or that a running node must not read.
+            ValueError: a file can not be used, or must not be read by a running node.
         """
         launched, values = values_of(self._at_launch), values_of(settings)
         for name in FILES:
@@ -444,7 +445,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         for text in handled.events:
             self.get_logger().info(text)
         for text in handled.warnings:
-            self.get_logger().warn(f'{text} (more of the kind are counted in /diagnostics)')
+            self.get_logger().warn(f'{text} (more of this kind are counted in /diagnostics)')
         if self._handled.get_subscription_count():
             self._handled.publish(serialise(handled_message(RosbagsMessages(), handled)))
 
@@ -460,7 +461,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         if name in self._heard:
             self._own.sent(output.data)
         inside = self._inside(output.topic)
-        # A message that only nodes of this process want needs no publishing.
+        # If only nodes of this process subscribe, the message is not published over ROS.
         if not inside or publisher.get_subscription_count():
             publisher.publish(output.data)
         for one in inside:
@@ -479,7 +480,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return [] if topic.startswith('/') else self._listeners(self._local_name(topic))
 
     def _local_name(self, topic: str) -> str:
-        """Name of a topic within this process; absolute ones, such as /tf, go over ROS."""
+        """Name of a topic in this process; absolute topics, such as /tf, pass over ROS."""
         if topic not in self._local_names:
             own = f'{self.get_fully_qualified_name()} {topic}'
             name = own if topic.startswith('/') else self.resolve_topic_name(topic)
@@ -505,7 +506,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._log_status(counts)
 
     def _log_status(self, counts: Counter[str]) -> None:
-        """Logs a line while messages arrive: at once if the status changed, else periodically."""
+        """Logs a line while messages arrive: at once after a status change, else periodically."""
         if self._session is None or counts['received'] == self._told_at:
             return
         state, self._told_at = self._session.state, counts['received']
@@ -537,7 +538,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return DiagnosticStatus.OK, f'{state.status}, {state.summary()}'
 
     def _hardware(self, state: SessionState | None) -> str:
-        """The camera: the frame of its messages, or else their topic."""
+        """Name of the camera: the frame of its messages or, if unknown, their topic."""
         if state is not None and state.frame_id:
             return state.frame_id
         # The local name of an absolute topic starts with the name of the node.

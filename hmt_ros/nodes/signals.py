@@ -10,8 +10,8 @@ from collections.abc import Callable
 def on_signals(stop: Callable[..., None]) -> None:
     """Calls a function when a signal asks the process to end; ignores signals during its exit.
 
-    A terminal and "ros2 launch" send one each. Python restores the default handlers before it
-    exits, so the second one would kill the process.
+    A terminal and "ros2 launch" send one signal each. Python restores the default handlers before
+    it exits, so the second signal would kill the process.
     """
     numbers = (signal.SIGINT, signal.SIGTERM)
     for number in numbers:

@@ -1,7 +1,7 @@
-"""Causes of silence: topics that a node waits for, their publishers, and similar topics.
+"""Causes of silent topics: missing publishers, other message types, and similar topic names.
 
-All methods but `arrived` run in the executor's thread, once per period of the diagnostics, and
-query the graph only for topics on which nothing arrives.
+All methods but `arrived` run in the executor's thread, once per period of the diagnostics. They
+query the ROS graph only for topics on which nothing arrives.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class Publication(NamedTuple):
     """A publication of another node on a topic.
 
     Attributes:
-        topic: its full name.
-        msgtype: for example 'sensor_msgs/msg/Image'.
-        by: full name of a node.
+        topic: full name of the topic.
+        msgtype: message type, for example 'sensor_msgs/msg/Image'.
+        by: full name of the publishing node.
     """
 
     topic: str
@@ -44,7 +44,7 @@ class SilentTopics:
     """Watches the topics that a node subscribes to.
 
     Attributes:
-        texts: cause of silence by silent topics, as found by the last `look`.
+        texts: explanation for each silent topic, as found by the last `look`.
     """
 
     def __init__(self, node: Node, warn: Callable[[str], None]) -> None:
@@ -53,13 +53,13 @@ class SilentTopics:
 
     @property
     def silence(self) -> float:
-        """Time since the last message of the source that sets the pace, s; 0 while they arrive."""
+        """Time since the last message that triggered an estimate, s; 0 while they arrive."""
         last = self._arrivals.get(self._pace)
         since = 0.0 if last is None else time.monotonic() - last
         return since if since > SILENCE else 0.0
 
     def listen(self, inputs: Iterable[SubscribedTopic], pace: str = '') -> None:
-        """Restarts with other subscriptions; without any, nothing is silent.
+        """Restarts with other subscriptions; without subscriptions, nothing is silent.
 
         Args:
             pace: source of the messages that trigger estimates.
@@ -76,7 +76,7 @@ class SilentTopics:
         self._arrivals[source] = self._arrivals[kind_of(source)] = now
 
     def look(self, needed: Iterable[NeededInput]) -> None:
-        """Finds silent topics among the needed ones, and warns of them."""
+        """Finds silent topics among the needed ones, and warns about them."""
         now = time.monotonic()
         newest = self._arrivals.get(self._pace, self._began)
         silent = [one for one in needed if self._is_silent(one, newest if one.with_each else now)]
@@ -99,7 +99,7 @@ class SilentTopics:
         return now - last >= SILENCE
 
     def _like(self, wanted: list[SubscribedTopic], names: list[str]) -> list[Publication]:
-        """Publications of other nodes on some topics, or with types that these may have.
+        """Publications of other nodes on topics `names`, or of a type that `wanted` could have.
 
         Silhouettes and overlays of the nodes of this package are left out: they are not camera
         images.
@@ -123,7 +123,7 @@ class SilentTopics:
 def why_silent(
     wanted: list[SubscribedTopic], names: list[str], published: list[Publication]
 ) -> str:
-    """Cause of silence on alternative topics, and the remedy."""
+    """Text on why a topic, with its alternatives, is silent, and the remedy."""
     topics = ' or '.join(
         f'{name} ({_short(one.msgtype)})' for one, name in zip(wanted, names, strict=True)
     )

@@ -21,7 +21,7 @@ from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 # For `~/handled`: a client that waits for each report must not miss the reports on a burst. One
-# turn of the estimating thread reports up to 100 dropped messages, and all that waited.
+# turn of the estimating thread reports up to 100 dropped messages, and all waiting messages.
 ANSWERS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
     depth=1,
@@ -43,7 +43,7 @@ class SubscribedTopic(NamedTuple):
     Attributes:
         source: name of the topic in the session.
         topic: name of the topic in ROS.
-        msgtype: for example 'sensor_msgs/msg/Image'.
+        msgtype: message type, for example 'sensor_msgs/msg/Image'.
         qos: quality of service of the subscription.
         largest: maximum size of an accepted message, bytes.
         waiting: maximum number of messages that wait during an estimate.
@@ -68,7 +68,7 @@ TRANSFORM_TOPICS = (
     SubscribedTopic(TF_STATIC, '/tf_static', TRANSFORMS_TYPE, _TF_STATIC_QOS, waiting=TF_QUEUE),
     SubscribedTopic(TF, '/tf', TRANSFORMS_TYPE, _TF_QOS, waiting=TF_QUEUE),
 )
-# Depth for all mixtures that arrive while `~/smooth_window` runs for some seconds.
+# Deep enough for the mixtures that arrive while `~/smooth_window` runs for some seconds.
 _MIXTURES = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
 CAMERA_INFO_TOPIC = SubscribedTopic(CAMERA_INFO, 'camera_info', 'sensor_msgs/msg/CameraInfo')
 
@@ -82,7 +82,7 @@ def image_topic(image_transport: str) -> SubscribedTopic:
 
 
 def input_topics(rows: Iterable[ImageInput]) -> Iterator[SubscribedTopic]:
-    """Topics of the inputs beside the images, by the table of inputs."""
+    """Topics of the inputs that accompany the images, from rows of the table of inputs."""
     for row in rows:
         for source, msgtype in row.types.items():
             yield SubscribedTopic(
@@ -96,7 +96,7 @@ def input_topics(rows: Iterable[ImageInput]) -> Iterator[SubscribedTopic]:
 
 
 def types_of_others(rows: Iterable[ImageInput], source: str) -> dict[str, str]:
-    """Message types of other packages that a `source` needs, each with its consumer."""
+    """Message types of other packages that a `source` needs, each with the name of its user."""
     return {row.types[DETECTIONS]: f'source {source}' for row in rows if DETECTIONS in row.types}
 
 
@@ -127,7 +127,7 @@ def read_installed_messages(msgtype: str, needed_by: str) -> None:
     """Reads the message definitions of an installed package.
 
     Args:
-        needed_by: consumer of the messages, for the error.
+        needed_by: name of the user of the messages, for the error.
 
     Raises:
         ValueError: the package is not installed.

@@ -1,7 +1,7 @@
 """A node that tracks people: the common part of nodes for one person and for several.
 
-A watchdog publishes a warning for robots if no image was answered for `stale_time`, by a monotonic
-clock.
+A watchdog publishes a warning for robots if no outputs for a new image were published for
+`stale_time`, by a monotonic clock.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _GLANCE = 0.05
 
 
 class TrackingNode(SessionNode[Any, Any]):
-    """A node of a session that tracks; see `SessionNode`."""
+    """A node around a session that tracks people; see `SessionNode`."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -75,10 +75,10 @@ class TrackingNode(SessionNode[Any, Any]):
 
     @abstractmethod
     def _start_asked_for(self, request: Reset.Request) -> TrackStart:
-        """The requested start of the tracks.
+        """Data that the new tracks start from, as requested.
 
         Raises:
-            ValueError: an unusable request.
+            ValueError: the request can not be used.
         """
 
     def _on_reset(self, request: Reset.Request, response: Reset.Response) -> Reset.Response:
@@ -95,7 +95,7 @@ class TrackingNode(SessionNode[Any, Any]):
     # Called by the watchdog thread.
 
     def _watch(self, session: TrackingSession, inactive: threading.Event) -> None:
-        """Publishes warnings for robots while no image is answered."""
+        """Publishes warnings for robots while there are no outputs for new images."""
         count, answered = session.answered, time.monotonic()
         while not inactive.wait(_GLANCE):
             now = time.monotonic()

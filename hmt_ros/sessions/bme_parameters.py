@@ -25,24 +25,24 @@ class BmeParameters(CameraNodeParameters):
     """All parameters of the BME node.
 
     Attributes:
-        model_file: Trained model, as `train` writes it; if empty, the small one that comes with the
+        model_file: Model file written by `train`; if empty, the small model shipped with the
             package.
-        background_file: Image of the empty scene as the camera sees it; if empty, it is learned
-            once nothing has moved for two seconds.
-        stature: Height of the person, m; 0 selects that of the model.
-        gravity: Direction of gravity in the camera optical frame, three numbers of any length.
-            Images and keypoints of a camera on its side are turned upright by it. Empty: it is
-            upright.
+        background_file: Image from the same camera without people; if empty, the background is
+            learned once nothing has moved for two seconds.
+        stature: Height of the person, m; 0 selects the height of the model's body.
+        gravity: Direction of gravity in the camera optical frame, three numbers of any scale, by
+            which images and keypoints of a camera on its side are turned upright; if empty, the
+            camera is upright.
         predict_from: Cue of the predictions: 'silhouettes', 'keypoints' of a detector (no image is
-            needed), or 'both'. With 'both' an image waits for its keypoints; silhouettes serve
-            where these show nobody.
-        lifter: Experts that predict from keypoints, 'keypoints', which ships, or a file that
-            'learn lifter' wrote.
-        propagation: How a prediction depends on the one before: 'none', or 'experts', rule (1) of
-            the paper, which needs a model trained with --dynamics.
+            needed), or 'both'. With 'both' an image waits for its keypoints, and silhouettes are
+            used if these show nobody.
+        lifter: Experts that predict poses from keypoints: 'keypoints' (shipped) or a file written
+            by 'learn lifter'.
+        propagation: Dependence of a prediction on the previous one: 'none', or 'experts', rule (1)
+            of the paper, which needs a model trained with --dynamics.
         max_hypotheses: Maximum number of components of a prediction.
-        tracked_interval: Interval between two predictions while pose_mixture says that the filter
-            tracks the person, by the stamps of the images, s; 0 predicts from every image.
+        tracked_interval: Interval between predictions while pose_mixture says that the filter
+            tracks the person, s, by image stamps; 0 predicts from every image.
     """
 
     model_file: str = parameter_field('', NEXT_CONFIGURE)

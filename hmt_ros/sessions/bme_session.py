@@ -1,26 +1,27 @@
 """Session of the pose predictor: images or keypoints in, mixtures over poses out.
 
-The rules, besides those of `CameraSession`:
+The rules, in addition to those of `CameraSession`:
 
 - Every usable image gets one prediction. A prediction without components means that nobody was
-  seen (the silhouette is too low for a person), or that this is unknown because the scene has not
-  been seen empty; `reason` is set then.
+  seen (the silhouette is too low for a person) or, if `reason` is set, that the background is
+  unknown because the scene has not been seen empty.
 - With `use_mask` the mask of an image is its silhouette; the background is not learned from an
   image whose mask shows somebody.
 - With `tracked_interval` the session subscribes to the track of the filter (`pose_mixture`). While
   the person is tracked, images within `tracked_interval` after the last prediction are not
-  evaluated. Their messages have the state of the track and no components, so that a subscriber that
-  waits for a prediction can continue. Such a message does not mean that nobody was seen.
-- The silhouette of every image is published if it has a subscriber: the result of background
-  subtraction, empty while the background is being learned. Images that are left to the track have
-  one, too. With `use_mask` no silhouette is published.
-- With `propagation` a prediction depends on the previous one, unless that is older than
+  evaluated. Instead, messages with the state of the track and without components are published,
+  so that subscribers do not wait. Such a message does not mean that nobody was seen.
+- The result of background subtraction is published as the silhouette of every image, evaluated or
+  not, if somebody subscribes. It is empty while the background is being learned. With `use_mask`
+  no silhouette is published.
+- With `propagation` a prediction depends on the previous one, unless the latter is older than
   `LONGEST_INTERVAL`, belongs to another calibration, or precedes a jump in time.
 - With `predict_from` 'keypoints' every message of keypoints gets one prediction, from the keypoints
   of the last second (`experts.lifter`); images are not used. It has no components if fewer than
   five landmarks are seen. With 'both' an image waits for the keypoints of exactly its stamp, for
   keypoints of a later stamp, or for an image that is `input_timeout` younger; its silhouette is
-  used if the keypoints show nobody. (The product of both is no better than keypoints alone.)
+  used if the keypoints show nobody. (The product of both predictions is no more accurate than the
+  one from keypoints.)
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ _TOPICS_OF_NODE = {**TOPICS, SILHOUETTE: PublishedTopic('sensor_msgs/msg/Image')
 LEAST_HEIGHT = 40
 # Maximum age of the previous prediction for propagation, s.
 LONGEST_INTERVAL = 0.5
-# Maximum time between an image and the last message of the track, ns.
+# Maximum time between an image and a message of the track that applies to the image, ns.
 _SURE_NS = SECOND_NS
 # Relative standard deviation of the size of a person whose stature is known.
 _MEASURED_SPREAD = 0.02
@@ -104,13 +105,13 @@ _MEASURED_SPREAD = 0.02
 class BmeState(CameraState):
     """State of the predictor: its status is 'no camera', 'learning', 'nobody' or 'predicting'.
 
-    The count 'predicted' is of images with or without a person, 'empty' of images without one,
-    and 'left' of images that were not evaluated because the person is tracked.
+    Counts: 'predicted' are all evaluated images, 'empty' the evaluated images without a person,
+    'left' the images that were not evaluated because the person is tracked.
 
     Attributes:
         modes: number of components of the last prediction.
         height: height of the last silhouette, px.
-        support: similarity of the silhouette to those of the training set, 0 to 1.
+        support: similarity of the silhouette to the training silhouettes, 0 to 1.
     """
 
     modes: int = 0
@@ -136,7 +137,7 @@ class BmeState(CameraState):
 class BmeSession(CameraSession[BmeParameters, BmeState]):
     """Predicts the poses in the images of one camera; see `Session` for arguments and attributes.
 
-    `predict_once` may be called by any thread.
+    `predict_once` is thread-safe.
     """
 
     TOPICS = _TOPICS_OF_NODE
@@ -152,7 +153,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._scene = EmptyScene(
             BackgroundModel.from_image(read_picture(file)) if file else BackgroundModel()
         )
-        # OpenCV's background model computes in an internal buffer: one thread at a time.
+        # OpenCV's background model has an internal buffer, so only one thread may use it at a time.
         self._background_in_use = threading.Lock()
         self._height, self._support, self._reason = 0, math.nan, ''
         # Whether the last prediction needed no background.
@@ -164,9 +165,9 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
     def restart(self) -> None:
         """See `Session`."""
-        # The background is kept. Last prediction, and its stamp, ns:
+        # Last prediction, and its stamp, ns. The background is kept.
         self._previous: tuple[GaussianMixture, int] | None = None
-        # Stamps of the last evaluated image, and of the last message of a tracked person, ns.
+        # Stamps of the last evaluated image, and of the last message with a tracked person, ns.
         self._looked: int | None = None
         self._tracked: int | None = None
         self._by_keypoints: KeypointPredictor | None = None
@@ -222,7 +223,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if camera is None:
             self._log.skip(
                 'camera_info',
-                f'keypoints of {stamp} ns are left out: no calibrated camera_info has come',
+                f'keypoints of {stamp} ns are not used: no calibrated camera_info has come',
             )
             return
         self._newest = stamp
@@ -248,7 +249,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             )
         taken = self._inputs[KEYPOINTS].take_all(stamp)
         for each, keypoints in taken.items():
-            # Keypoints may arrive after those of a later image.
+            # Keypoints may arrive out of order.
             if keypoints is not None and each / SECOND_NS > made.newest:
                 known, _ = keypoints.named_for(
                     self._predictor.body, self.parameters.keypoint_scheme
@@ -266,7 +267,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if not in_turn or not self._is_left_to_track(stamp) or self._wanted(SILHOUETTE):
             super()._take_image(message, stamp)
             return
-        # The image is not even decoded.
+        # The image is left to the track without being decoded.
         self._newest = stamp
         self._leave_to_track(stamp, str(message.header.frame_id) or self._frame or FRAME_ID)
 
@@ -416,9 +417,9 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         return pose_mixture_message(self._messages, content)
 
     def predict_once(self, message: Any) -> Any:
-        """Predicts from one image alone, with the present background.
+        """Predicts from a single image, with the present background.
 
-        May be called by any thread, at any time.
+        Thread-safe.
 
         Args:
             message: sensor_msgs/Image or CompressedImage.

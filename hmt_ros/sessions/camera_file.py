@@ -30,7 +30,7 @@ else:
     import tomli as tomllib
 
 LARGEST_FILE = 1_000_000  # bytes
-# Names of the entries in files of several programs.
+# Names of the same entry in the files of different programs.
 _MATRIX = (
     'camera_matrix',
     'Camera_Matrix',
@@ -93,13 +93,13 @@ def read_camera(path: Path, size: tuple[int, int], tell: Tell = lambda text: Non
     """Read the camera of a calibration file.
 
     Args:
-        path: the file, or FILE:NAME for the camera NAME of several in the file.
-        size: width and height of the images, px; a calibration for another size of the same shape
-            is scaled, and a calibration without a size is assumed to be for this size.
-        tell: called with a line on each neglected or scaled entry.
+        path: the file; FILE:NAME selects the camera NAME if the file has several cameras.
+        size: width and height of the images, px; a calibration for another size of the same aspect
+            ratio is scaled, and a calibration without a size is assumed to be for this size.
+        tell: function that is called with a line on each neglected or scaled entry.
 
     Raises:
-        ValueError: the file has no calibration, a damaged one, or one for another shape of images.
+        ValueError: the file has no calibration, or one that is damaged or for another aspect ratio.
     """
     file, name = path, ''
     if not path.exists() and ':' in path.name:
@@ -131,7 +131,7 @@ def _content(path: Path, text: str) -> tuple[Any, str]:
     start = text.lstrip()
     if start.startswith('<?xml'):
         return _of_xml(start), 'pinhole'
-    # Removes the points of a calibration pattern and the poses of its images, which are not needed.
+    # Removes long lists that are not needed: points of a calibration pattern, poses of its images.
     text = _LONG_LIST.sub('"a long list"', start)
     of_opencv = start.startswith(('%YAML', '{'))
     if of_opencv:
@@ -213,7 +213,7 @@ def _entries(content: dict[Any, Any], model: str, size: tuple[int, int]) -> dict
 
 
 def _first(content: dict[Any, Any], names: tuple[str, ...]) -> Any:
-    """Return the entry of the first name that is present; None if none is."""
+    """Return the entry of the first name that is present; None if no name is present."""
     return next((content[name] for name in names if content.get(name) is not None), None)
 
 

@@ -31,8 +31,8 @@ class CameraFrames:
     """Gravity and pose of the camera, relative to frames that are connected by transforms.
 
     Args:
-        gravity_frame: name of a frame with z up; '': none.
-        fixed_frame: name of a stationary frame; '': none.
+        gravity_frame: name of a frame with z up; '': no such frame.
+        fixed_frame: name of a stationary frame; '': no such frame.
         floor: whether z = 0 of `gravity_frame` is the floor.
 
     Attributes:
@@ -70,7 +70,7 @@ class CameraFrames:
         self._gravity, self.newest, self.pose = None, False, None
 
     def is_settled(self, camera_frame: str, stamp_ns: int, timeout_ns: float) -> bool:
-        """Whether an image need not wait: its transforms are known, or later ones have come."""
+        """Whether an image need not wait: its transforms are known, or later ones have arrived."""
         if self._transforms.has_later(stamp_ns, timeout_ns):
             return True
         try:
@@ -104,8 +104,8 @@ class CameraFrames:
             found = self._transforms.lookup(camera_frame, name, stamp_ns)
         except TransformError as error:
             text = (
-                f'no transform from gravity_frame {name!r} to {camera_frame!r} at the image '
-                f'of {stamp_ns} ns: {error}; the track continues with what was known of gravity'
+                f'no transform from gravity_frame {name!r} to {camera_frame!r} at the image of '
+                f'{stamp_ns} ns: {error}; the track continues with the last known gravity'
             )
             return [('no transform', text)]
         up = found.rotation[:, 2]
@@ -127,7 +127,7 @@ class CameraFrames:
             self.pose = None
             text = (
                 f'no transform from {camera_frame!r} to fixed_frame {name!r} at the image of '
-                f'{stamp_ns} ns: {error}; the camera is taken to go on as before for '
+                f'{stamp_ns} ns: {error}; the motion of the camera is assumed to continue for '
                 f'{MAX_EXTRAPOLATION_TIME} s'
             )
             return [('no pose of the camera', text)]
@@ -138,7 +138,7 @@ def unit_vector(vector: Sequence[float], name: str) -> Array:
     """Scale a vector (3,) to unit length.
 
     Raises:
-        ValueError: the vector is not three finite numbers, or has no length.
+        ValueError: the vector is not three finite numbers, or is zero.
     """
     v = np.asarray(vector, dtype=np.float64)
     size = length(v) if v.shape == (3,) else math.nan

@@ -1,13 +1,14 @@
 """Sessions that estimate from the images of one camera.
 
 Images are used in the order of their stamps. They wait for the first calibrated camera_info and for
-other inputs (`image_inputs`); at most `MOST_INCOMPLETE` wait, and the oldest are dropped. A session
-is late if messages have arrived during an estimate while images waited for it. Then only the newest
-`queue_size` of the images that wait for no other input are used.
+other inputs (`image_inputs`); if more than `MOST_INCOMPLETE` images wait, the oldest are dropped. A
+session is late if messages have arrived during an estimate while images waited for it. Then, of the
+images whose other inputs are complete, only the newest `queue_size` are used.
 
-If a frame is named, an image also waits for the transforms of its stamp, or for an image or a
-transform that is `input_timeout` younger, and never so long that it would be dropped. Without its
-transforms the last known gravity applies, and the camera is assumed to continue its motion.
+If the parameters name a frame, an image also waits for the transforms of its stamp. This wait ends
+with an image or a transform that is `input_timeout` younger, and before the image would be dropped.
+Without its transforms the last known gravity applies, and the camera is assumed to continue its
+motion.
 """
 
 from __future__ import annotations
@@ -56,14 +57,14 @@ FRAME_ID = 'camera_optical_frame'  # default if neither image nor camera_info na
 
 CameraParameters = TypeVar('CameraParameters', bound=CameraNodeParameters)
 
-# Maximum number of images that wait for other inputs: half a second of a usual camera.
+# Maximum number of images that wait for other inputs: half a second at a common image rate.
 MOST_INCOMPLETE = 16
 # Maximum size of the images that wait, bytes.
 MOST_BYTES = 2**29
 _LARGEST_PICTURE_FILE = 2**28  # bytes
-# Lower bound of the time ahead up to which a later input ends the wait of an image, s.
+# Minimum length of the time window after an image in which a later input ends its wait, s.
 _LATER = 1.0
-# Maximum number of frames that are remembered; a camera has one.
+# Maximum number of remembered frame names per source; a camera has one.
 _MOST_FRAMES = 8
 
 
@@ -88,7 +89,7 @@ class WaitingImage(NamedTuple):
 
     @property
     def mask(self) -> Mask | None:
-        """Mask (H, W) of the person by a segmenter; empty if nobody was seen, None if unknown."""
+        """Mask (H, W) of the person from a segmenter; empty if nobody was seen, None if unknown."""
         return self.content(MASK)
 
     @property
@@ -117,7 +118,8 @@ class CameraSession(Session[CameraParameters, State]):
 
     Attributes:
         rows: inputs that may accompany the images.
-        frames: frames related to the camera by transforms; if none is named, transforms are unused.
+        frames: frames that transforms relate to the camera; without a named frame, transforms are
+            not used.
     """
 
     COUNTED = IMAGE
@@ -134,16 +136,16 @@ class CameraSession(Session[CameraParameters, State]):
         self._newest: int | None = None
         self.rows = self.inputs_of(self.parameters)
         self._inputs = ImageInputs(self.rows, self._log)
-        # Messages of `floats` may have no stamp: that of the newest camera_info replaces it.
+        # Messages of `floats` without a stamp get the stamp of the newest camera_info.
         self._floats, self._info_stamp = self.parameters.source == 'floats', 0
-        # Number of images since the last estimate; whether images were left when it was
-        # interrupted; and stamps of dropped images.
+        # Number of images since the last estimate; whether an interruption left images waiting;
+        # stamps of dropped images.
         self._fresh = 0
         self._left = False
         self._dropped: deque[int] = deque(maxlen=REMEMBERED)
 
     def needed_inputs(self) -> list[NeededInput]:
-        """Inputs that are needed at present; may be called by any thread."""
+        """Inputs that are needed at present. Thread-safe."""
         needed = super().needed_inputs()
         if self._camera is None and not self._uncalibrated:
             needed.append(NeededInput((CAMERA_INFO,)))
@@ -154,7 +156,7 @@ class CameraSession(Session[CameraParameters, State]):
 
     @classmethod
     def inputs_of(cls, parameters: Any) -> tuple[ImageInput, ...]:
-        """Return the inputs that may accompany the images, by the parameters."""
+        """Return the inputs that may accompany the images, given the parameters."""
         return (MASK_INPUT,)
 
     def _awaited(self) -> list[ImageInput]:
@@ -163,7 +165,7 @@ class CameraSession(Session[CameraParameters, State]):
 
     @abstractmethod
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
-        """Estimates from an image, which has the size of the camera."""
+        """Estimates from an image; its size has been checked."""
 
     @abstractmethod
     def _status(self) -> tuple[str, str]:
@@ -197,7 +199,7 @@ class CameraSession(Session[CameraParameters, State]):
         return self._newest - stamp > self.parameters.input_timeout * SECOND_NS
 
     def _has_transforms(self, waiting: WaitingImage) -> bool:
-        """Whether an image does not wait for transforms."""
+        """Whether an image has its transforms, or no longer waits for them."""
         if not self.frames.wanted or len(self._waiting) > self.most_waiting:
             return True
         timeout = self.parameters.input_timeout * SECOND_NS
@@ -207,7 +209,7 @@ class CameraSession(Session[CameraParameters, State]):
 
     def _use(self, source: str, turn: Turn) -> None:
         super()._use(source, turn)
-        # Messages that were put aside before do not mean that the session is late.
+        # Messages that were put aside earlier do not make the session late.
         self._fresh -= max(len(turn.use) - 1, 0)
 
     def _jump_back(self, first: int, last: int) -> None:
@@ -268,9 +270,9 @@ class CameraSession(Session[CameraParameters, State]):
             self.restart()
 
     def _see_frame(self, source: str, message: Any) -> None:
-        """Warns once for each further frame that the messages of a camera name.
+        """Warns once for each additional frame that the messages of a source name.
 
-        Otherwise two publishers on one topic, or the camera_info of another camera, go unnoticed.
+        This reveals two publishers on one topic, or the camera_info of another camera.
         """
         frame, seen = str(message.header.frame_id), self._named_frames[source]
         if not frame or frame in seen or len(seen) == _MOST_FRAMES:
@@ -288,9 +290,9 @@ class CameraSession(Session[CameraParameters, State]):
             self._log.note(
                 'frame_id',
                 f'{self._on_topic(IMAGE)} has frame_id {images[-1]!r}, '
-                f'{self._on_topic(CAMERA_INFO)} has {infos[-1]!r}: results are in that of the '
-                'image; if both are of one camera, set one frame_id in its driver, else remap '
-                'camera_info',
+                f'{self._on_topic(CAMERA_INFO)} has {infos[-1]!r}: results are in the frame of '
+                'the image; if both belong to one camera, set one frame_id in its driver, else '
+                'remap camera_info',
                 warn=True,
             )
 
@@ -377,7 +379,7 @@ class CameraSession(Session[CameraParameters, State]):
         self._estimate(waiting._replace(frame_id=frame, given=given), camera)
 
     def _frame_of(self, waiting: WaitingImage) -> str:
-        """Return the optical frame that the image names, or else the camera_info."""
+        """Return the optical frame named by the image, or else by the camera_info."""
         return waiting.frame_id or self._frame or FRAME_ID
 
     def _status_and_wants(self) -> tuple[str, str]:
@@ -400,7 +402,7 @@ def camera_moved_fault(shift: float, stamp_ns: int, remedy: str) -> str:
 
     Args:
         shift: shift of the scene, px; NaN: unknown.
-        remedy: action that takes a new background.
+        remedy: advice to the user on how to take a new background.
     """
     far = 'elsewhere' if math.isnan(shift) else f'{shift:.0f} px away'
     return (

@@ -33,9 +33,9 @@ NEXT_CONFIGURE = 'next configure'
 AT_LAUNCH = 'at launch'
 EFFECTS = {
     AT_ONCE: 'A new value takes effect at once.',
-    NEXT_TRACK: 'A new value takes effect when the next track starts, after ~/reset for example.',
-    NEXT_WINDOW: 'A new value takes effect when the next window starts, after a jump in time say.',
-    NEXT_CONFIGURE: 'A new value takes effect when the node is configured the next time.',
+    NEXT_TRACK: 'A new value takes effect when the next track starts, for example after ~/reset.',
+    NEXT_WINDOW: 'A new value takes effect with the next window, for example after a jump in time.',
+    NEXT_CONFIGURE: 'A new value takes effect when the node is next configured.',
     AT_LAUNCH: 'The value can only be set at launch.',
 }
 
@@ -87,16 +87,16 @@ class NodeParameters:
     """Parameters that all nodes have.
 
     Attributes:
-        reset_on_time_jump: If true, two messages in a row that are older than the one before
-            restart the estimate; if false, it takes three that are at least a second older, and
-            others are skipped. The default is the value of use_sim_time.
-        queue_size: Maximum number of messages that wait to be estimated from; when the node is late
-            the oldest are dropped.
+        reset_on_time_jump: If true, the estimate restarts after two consecutive messages that are
+            older than the newest one before them; if false, after three that are at least a second
+            older. Other old messages are skipped. The default is the value of use_sim_time.
+        queue_size: Maximum number of messages that wait for an estimate; when the node is late, the
+            oldest are dropped.
         autostart: If true, the node configures and activates itself; if false, it waits for its
             lifecycle services.
-        file_folders: Folders, separated by ':', in which files must lie that a parameter names
-            while the node runs; empty: the share folder of the package, the home of the user, and
-            the working folder. What is named at launch may lie anywhere.
+        file_folders: Folders, separated by ':', that must contain all files that parameters name at
+            run time; if empty, the share folder of the package, the user's home and the working
+            folder. Files named at launch may be anywhere.
     """
 
     reset_on_time_jump: bool = parameter_field(False, AT_ONCE)
@@ -110,10 +110,10 @@ class ImageNodeParameters(NodeParameters):
     """Parameters of the nodes that subscribe to images.
 
     Attributes:
-        image_transport: Transport of the images, 'raw' (topic image) or 'compressed' (topic
+        image_transport: Transport of the images: 'raw' (topic image) or 'compressed' (topic
             image/compressed).
         queue_size: Maximum number of complete images that wait while the node is late; the oldest
-            are dropped, so that 1 leaves the newest.
+            are dropped, so 1 keeps the newest.
     """
 
     queue_size: int = parameter_field(1, AT_ONCE, (1, 1000))
@@ -128,19 +128,19 @@ class CameraNodeParameters(ImageNodeParameters):
     """Parameters of the nodes that estimate from the images of a calibrated camera.
 
     Attributes:
-        use_mask: If true, masks of a segmenter replace background subtraction, and an image waits
-            for the mask of its stamp.
-        source: Type of the messages with keypoints, 'keypoints' (hmt_msgs/Keypoints2D, on the topic
+        use_mask: If true, masks from a segmenter replace background subtraction, and each image
+            waits for the mask with its stamp.
+        source: Type of the keypoint messages: 'keypoints' (hmt_msgs/Keypoints2D on the topic
             keypoints), or on the topic detections 'skeleton2d' (hri_msgs/Skeleton2D), 'yolo'
             (yolo_msgs/DetectionArray) or 'floats' (std_msgs/Float32MultiArray).
-        person_id: Identity that the detector gives the tracked person; if empty, the largest person
-            at first, then the one nearest to where this person was.
-        keypoint_scheme: Scheme of keypoints, 'auto' (recognised by their names; the order of
-            'coco17' for 'yolo' and 'floats'), 'joints' (those of the body itself), 'coco17',
-            'halpe26', 'body25', 'mediapipe33', 'h36m17', 'skeleton2d', 'smpl24', 'mhr70', or
-            another name of docs/keypoints.md.
-        input_timeout: Maximum time that an image waits for each input of its stamp, by the stamps
-            of later messages, s. A later input of the kind ends the wait.
+        person_id: Detector's identity of the tracked person; if empty, the largest person is
+            tracked at first, then the person nearest to the last position.
+        keypoint_scheme: Keypoint scheme: 'auto' (recognised by the names, or 'coco17' order for
+            'yolo' and 'floats'), 'joints' (joints of the body model), 'coco17', 'halpe26',
+            'body25', 'mediapipe33', 'h36m17', 'skeleton2d', 'smpl24', 'mhr70', or another name in
+            docs/keypoints.md.
+        input_timeout: Maximum time that an image waits for each input with its stamp, s, measured
+            by the stamps of later messages. A later input of the same kind ends the wait.
     """
 
     use_mask: bool = parameter_field(False, AT_ONCE)

@@ -32,8 +32,8 @@ class FixedFrame:
 
     Attributes:
         name: name of the frame, whose z axis points up.
-        camera: pose of the camera in it: p_fixed = R p_camera + t.
-        turn: change of the root's angle about z by the transform at the previous image, rad; it
+        camera: pose of the camera in the frame: p_fixed = R p_camera + t.
+        turn: angle about z that the transform added to the root at the previous image, rad; it
             determines the number of whole turns.
     """
 
@@ -60,8 +60,9 @@ class FixedFrame:
         """Transform a mixture over poses in the camera frame, and velocities (K, d), if known.
 
         Returns:
-            Both in the frame `optical`, with root angles relative to its axes. Means are
-            transformed exactly, covariances and velocities with the Jacobian at the means.
+            Mixture and velocities in the frame `optical`, with root angles relative to its axes.
+            Means are transformed exactly, covariances and velocities with the Jacobian at the
+            means.
         """
         motion, upright = self.motion, body.levelled(np.eye(3))
         means = motion.free_poses(body, mixture.means, self.turn, upright)
@@ -72,7 +73,7 @@ class FixedFrame:
         return GaussianMixture(mixture.weights, means, covariances), velocities
 
     def turn_of(self, body: Body, pose: Array) -> float:
-        """Return the change of the root's angle about z for a pose (d,), rad; see `turn`."""
+        """Return the angle about z, rad, that the transform adds to the root of a pose (d,)."""
         about_z = root_rotation_dofs(body.skeleton)[0]
         upright = body.levelled(np.eye(3))
         placed = self.motion.free_poses(body, pose[None], self.turn, upright)[0]

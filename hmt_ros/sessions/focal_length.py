@@ -1,7 +1,8 @@
 """Uncalibrated focal length, and the error of all depths that follows from it.
 
-An image gives the directions of the joints, and the lengths of the body give their distance: a
-focal length that is wrong by the factor 1 + e only moves the person along the optical axis.
+An image gives the directions of the joints, and the lengths of the body give their distances.
+Therefore a focal length that is wrong by a factor 1 + e only moves the person along the optical
+axis.
 
     z ~ f    =>    C = S + (s z)^2 e_z e_z'            e_z: the depth of the root
 
@@ -22,8 +23,8 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.camera_file import camera_of_view
 
-# Field of view of a common camera along the longer side of its images, degrees, and the relative
-# standard deviation of the focal lengths of cameras that people use: 51 to 72 degrees.
+# Field of view of a common camera along the longer side of its images, degrees, and relative
+# standard deviation of the focal lengths of common cameras, which corresponds to 51 to 72 degrees.
 USUAL_FOV, USUAL_SIGMA = 60.0, 0.2
 
 

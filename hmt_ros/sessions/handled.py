@@ -1,6 +1,6 @@
-"""Reports of sessions: the outcome of each message, and counts over all of them.
+"""Reports of sessions: the outcome of each message, and counts over all messages.
 
-The kind of a fault or a remark is its name in the diagnostics, a word or two.
+The kind of a fault or a remark is a word or two that names it in the diagnostics.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Output:
 
     Attributes:
         topic: a topic that the node publishes.
-        stamp_ns: stamp of the image that it is about, ns.
+        stamp_ns: stamp of the message, ns.
         message: the message; receivers must not change it.
     """
 
@@ -58,9 +58,9 @@ class Handled:
         stamp_ns: stamp of the message, ns.
         faults: faults of the message, or of a message that waited for it; empty if it was used.
         warnings: warnings for the log: the first fault of each kind.
-        published: (topic, stamp) of all messages that were published, in their order.
-        events: remarks for the log of a node that are no faults, for example the start of a track;
-            not part of hmt_msgs/Handled.
+        published: (topic, stamp) of all published messages, in the order of publication.
+        events: events for the log of a node, for example the start of a track; not part of
+            hmt_msgs/Handled.
     """
 
     source: str
@@ -75,12 +75,12 @@ class HandlingLog:
     """Collects the report on the present message, and counts over all messages.
 
     Attributes:
-        counts: numbers of messages that are estimated from: 'received', and of these 'skipped',
-            'dropped' and keys of the session.
+        counts: numbers of messages that trigger estimates, by outcome: 'received', 'skipped',
+            'dropped', and keys of the session.
         faults: number of faults by kind.
         last_fault: newest fault; '' before the first.
-        held_up: input that the last dropped message waited for; '' if it waited for its turn only.
-        prefix: prefix of all texts, which names the person that they are about.
+        held_up: input that the last dropped message waited for; '' if the node was only late.
+        prefix: prefix of all texts; names the person concerned if there are several.
     """
 
     def __init__(self) -> None:
@@ -115,12 +115,12 @@ class HandlingLog:
         self._events.append(one_line(f'{self.prefix}{text}'))
 
     def skip(self, kind: str, text: str) -> None:
-        """Reports a message that is estimated from and can not be used."""
+        """Reports a message that should trigger an estimate, but can not be used."""
         self.counts['skipped'] += 1
         self.fault(kind, text)
 
     def drop(self, text: str) -> None:
-        """Reports a message that is dropped because the node is late; this counts as no fault."""
+        """Reports a message that is dropped because the node is late; this is not a fault."""
         self.counts['dropped'] += 1
         self.held_up = ''
         self._told.append(one_line(text))
@@ -132,7 +132,7 @@ class HandlingLog:
         self.held_up = ''
 
     def give_up(self, kind: str, held_up: str, text: str) -> None:
-        """Reports a message that is dropped because an input did not come.
+        """Reports a message that is dropped because an input did not arrive.
 
         Args:
             held_up: input that the message waited for.

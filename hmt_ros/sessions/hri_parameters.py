@@ -22,21 +22,21 @@ class HriParameters(NodeParameters):
     """All parameters of the node that speaks REP 155.
 
     Attributes:
-        namespaces: Namespaces of the people whose mixtures are taken, separated by blanks, such as
+        namespaces: Namespaces of the people whose mixtures are used, separated by blanks, such as
             '/humans/bodies/p1 /lab/anna'; if empty, all below /humans/bodies in which mixtures are
             published.
-        mixture_topic: Name of the mixtures in these namespaces, 'pose_mixture' of the filter, or
-            'smoothed_pose_mixture' of the smoother, which are steadier and come later.
-        image_transport: Transport of the images, 'raw' (topic image) or 'compressed' (topic
+        mixture_topic: Topic of the mixtures in each person's namespace: 'pose_mixture' of the
+            filter, or 'smoothed_pose_mixture' of the smoother, which is steadier but later.
+        image_transport: Transport of the images: 'raw' (topic image) or 'compressed' (topic
             image/compressed).
-        publish_cropped: If true, the node subscribes to the images, and publishes the part of each
-            that shows a body.
-        publish_links: If true, /tf tells the frames of all links of a body; if false, only that of
-            the body itself, for use with robot_state_publisher.
-        added_joints: If true, the kinematic model has four joints beyond the reference of REP 155
-            and passes through all joint positions. If false, the trunk only leans, and the
+        publish_cropped: If true, the node subscribes to images and publishes the part of each that
+            shows a body.
+        publish_links: If true, /tf has the frames of all links of a body; if false, only the frame
+            of the body itself, for use with robot_state_publisher.
+        added_joints: If true, the kinematic model has four joints more than the reference of REP
+            155 and passes through all joint positions; if false, the trunk only leans, and the
             shoulders are fixed to it.
-        queue_size: Maximum number of mixtures that wait; when the node is late the oldest are
+        queue_size: Maximum number of mixtures that wait; when the node is late, the oldest are
             dropped.
     """
 

@@ -1,10 +1,10 @@
 """Session of the REP 155 bridge: mixtures of people in, bodies of REP 155 out.
 
-The rules, besides those of `Session`:
+The rules, in addition to those of `Session`:
 
-- A track of a person is a body. Its identity consists of the name of the person (the namespace
+- Each track of a person is a body. Its identity consists of the name of the person (the namespace
   without /humans/bodies/) and the number of the track: p1_2 is the second track in
-  /humans/bodies/p1. A person who is found again by a new track is a new body; no identity is used
+  /humans/bodies/p1. If a new track finds a person again, this is a new body; no identity is used
   twice.
 - /humans/bodies/tracked lists the bodies that are tracked. A body whose track is lost is not in the
   list until the same track is found again. A body ends with its track, with a mixture without
@@ -69,15 +69,15 @@ BODY_TOPICS = {
     'cropped': PublishedTopic('sensor_msgs/msg/Image'),
 }
 MIXTURE = 'pose_mixture'
-# Minimum weight of the shown mode relative to the heaviest mode.
+# Minimum weight, relative to the heaviest mode, at which the shown mode is kept.
 _KEPT = 0.5
 # Maximum change of a joint's origin without a new URDF, m.
 _RESHAPED = 0.005
 # Time without a mixture after which a body ends, by the stamps of camera_info, s.
 LONGEST_SILENCE = 2.0
-# Number of people without a body who are remembered, for the numbers of their tracks.
+# Maximum number of people without a body whose last body number is remembered.
 _REMEMBERED = 1000
-# Number of images kept for cropping; a filter that is further behind drops images itself.
+# Number of images kept for cropping; a filter with a larger delay drops images itself.
 _IMAGES = 20
 
 
@@ -102,10 +102,10 @@ class _Person:
 
     Attributes:
         name: name of the person.
-        identity: identity of the body; '' while there is none.
+        identity: identity of the body; '' without a body.
         tracked: whether the body is listed as tracked: it is neither lost nor ended.
         track: number of the body's track; 0: unnumbered.
-        bodies: number in the newest identity.
+        bodies: number of the newest body, which its identity contains.
         heard: time of the last mixture, by the stamps of camera_info, ns.
         mode: identity of the mode that is shown; 0: none.
         angles: angles of the reference model in the previous image.
@@ -127,7 +127,7 @@ class _Person:
         self.identity, self.tracked = '', False
 
     def goes_on(self, track: int) -> bool:
-        """Whether the present body belongs to a track; 0 is an unnumbered track."""
+        """Whether the present body belongs to a track, given its number; 0: unnumbered."""
         return bool(self.identity) and track == self.track
 
     def begin(self, track: int) -> None:
@@ -178,11 +178,11 @@ class HriSession(Session[HriParameters, HriState]):
 
     @property
     def identities(self) -> set[str]:
-        """Identities of the bodies that have topics: tracked, or lost and not ended."""
+        """Identities of the bodies that have topics: tracked ones, and lost ones until they end."""
         return {person.identity for person in self._people.values() if person.identity}
 
     def needed_inputs(self) -> list[NeededInput]:
-        """Inputs that are needed at present; may be called by any thread."""
+        """Inputs that are needed at present. Thread-safe."""
         return [NeededInput((mixture_source(name),)) for name in self.parameters.named]
 
     def _end(self) -> int:
@@ -295,7 +295,7 @@ class HriSession(Session[HriParameters, HriState]):
             self._log.note(
                 'other camera',
                 f'mixtures of {person.name} are in the frame {content.frame_id}, camera_info is '
-                f'that of {self._frame}: their places in the image are not published; remap '
+                f'that of {self._frame}: their image positions are not published; remap '
                 'camera_info and image to the camera of the filter',
             )
             return
@@ -351,7 +351,7 @@ class HriSession(Session[HriParameters, HriState]):
     def _publish_cropped(self, topic: str, region: Array, stamp: int) -> None:
         image = self._images.get(stamp)
         if image is None:
-            text = f'no image of {stamp} ns has come, of which a mixture tells: it is not cropped'
+            text = f'no image of {stamp} ns has come for a mixture: no cropped image is published'
             self._log.note('no image', text)
             return
         try:
@@ -380,7 +380,7 @@ def _name_in(namespace: str) -> str:
 
 
 def _shown_mode(content: PoseMixture, before: int) -> int:
-    """Return the index of the mode to show; `before` is the identity shown before, or 0."""
+    """Return the index of the mode to show; `before` is the identity of the last one, or 0."""
     assert content.identities is not None
     heaviest = int(np.argmax(content.weights))
     for k in np.flatnonzero(content.identities == before) if before else ():

@@ -18,7 +18,7 @@ from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture
 
 # Maximum mean speed of the joints relative to the pelvis, m/s, and additional distance of modes of
-# two images, m: together the reach of a mode whose ancestry is unknown.
+# two images, m; together they limit which modes a mode of unknown ancestry may continue.
 FASTEST, TREMBLE = 2.0, 0.05
 
 
@@ -49,7 +49,7 @@ class KeptMixtures(NamedTuple):
 
 
 def evidence_of(content: PoseMixture) -> Evidence:
-    """Return the evidence in a mixture; without an error model, errors are independent.
+    """Return the evidence in a mixture; without an error model, errors count as independent.
 
     If the posterior weights of the modes are not given, the weights of the mixture replace them.
     The modes have no ancestry yet, see `continued`.
@@ -60,7 +60,8 @@ def evidence_of(content: PoseMixture) -> Evidence:
     """
     if content.kind is MixtureKind.FORECAST:
         raise MessageError(
-            'mixture is of the kind FORECAST, wanted LIKELIHOOD: no image speaks of a forecast',
+            'mixture is of the kind FORECAST, wanted LIKELIHOOD: a forecast contains no '
+            'evidence of an image',
             'kind',
         )
     mixture, share, time = content.mixture, content.error_share, content.error_time
@@ -85,11 +86,11 @@ def continued(
 
     Args:
         evidence: evidence of the image.
-        content: content of its message, with the ancestry by the filter.
+        content: content of the message about the image, with the ancestry from the filter.
         before: evidence of the previous image.
         points, points_before: (K, P, 3) and (M, P, 3) points of the modes of both images, m. They
-            are used if the ancestry is unknown or refers to an image that has not come: a mode
-            may then continue all modes within reach.
+            are used if the ancestry is unknown or refers to an image that was not received: a mode
+            then continues all modes within reach.
     """
     modes, others = evidence.modes, before.modes
     ancestry, known = content.ancestry, content.ancestry_stamp_ns == others.stamp_ns

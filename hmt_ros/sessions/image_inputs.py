@@ -1,12 +1,13 @@
-"""Inputs that accompany the images of a camera: their table, and the inputs that wait for an image.
+"""Table of the inputs that accompany camera images, and storage of those that wait for an image.
 
 `INPUTS` is the table of topics, types, readers, the parameters that make images wait for an input,
 and reports of missing inputs. Sessions, nodes, replay and recording use it. A new input needs a row
 here, a parameter that enables it, and code that uses its content.
 
-An input belongs to the image of exactly its stamp; of several with one stamp the last counts. If
-its parameter is true, an image waits for the input of its stamp, for an input of a later stamp, or
-for an image that is `input_timeout` younger. An unusable input counts as an empty one.
+An input belongs to the image of exactly its stamp; if several have the same stamp, the last is
+used. If the parameter of an input is true, an image waits for the input of its stamp, for an input
+of a later stamp, or for an image that is `input_timeout` younger. An unusable input is treated as
+an empty one.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ IMAGE_TYPE, COMPRESSED_TYPE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/Compress
 MASK, COMPRESSED_MASK, DEPTH = 'mask', 'mask/compressed', 'depth'
 KEYPOINTS, KEYPOINTS_3D, DETECTIONS = 'keypoints', 'keypoints_3d', 'detections'
 PREDICTION = 'pose_prediction'
-# Types of detections by value of the parameter `source`.
+# Message types of detections, by value of the parameter `source`.
 SOURCES = {
     'people': PEOPLE_2D,
     'yolo': YOLO,
@@ -47,19 +48,20 @@ LARGEST, LARGEST_MASK, LARGEST_DEPTH = 2**24, MAX_PIXELS + 2**16, 4 * MAX_PIXELS
 
 @dataclass(frozen=True)
 class ImageInput:
-    """An input: a row of the table.
+    """An input that accompanies images: a row of the table.
 
     Attributes:
         name: name of the input.
-        types: types of its messages, by source; the source is also the name of the topic.
-        parameter: name of the parameter that makes images wait for the input; '': they always do.
-        read: returns the content of a message with a stamp, None if it is empty; raises ValueError,
-            in one line, if the message can not be used.
+        types: message types of the input, by source; the source is also the name of the topic.
+        parameter: name of the parameter that makes images wait for the input; '': they always wait.
+        read: function of a message and its stamp that returns the content, or None if it is empty;
+            raises a one-line ValueError if the message can not be used.
         told: whether an image without the input, and an input without an image, are reported.
-        pixels: remedy, possibly '', if its size differs from the image's; None: it has no pixels.
+        pixels: end of the error text if input and image differ in size, with a remedy or '';
+            None: the input has no pixels.
         remembered: maximum number of inputs that wait for their image.
         largest: maximum size of a message, bytes.
-        reliable: whether no message may be lost in transit.
+        reliable: whether the subscription is reliable, so that no message is lost in transit.
         together: whether inputs of earlier images are kept and used with the next image.
     """
 
@@ -75,7 +77,7 @@ class ImageInput:
     together: bool = False
 
     def is_used(self, parameters: Any) -> bool:
-        """Whether images wait for the input, by the parameters of a node."""
+        """Whether images wait for the input, given the parameters of a node."""
         return not self.parameter or bool(getattr(parameters, self.parameter, False))
 
 
@@ -90,7 +92,7 @@ def _read_depth(message: Any, stamp: int) -> Any:
     depth = usable_depths(decode_depth(message))
     if not depth.any():
         raise ValueError(
-            f'depth of {stamp} ns lies nowhere between {NEAREST:g} and {FURTHEST:g} m: wanted '
+            f'depth of {stamp} ns has no value between {NEAREST:g} and {FURTHEST:g} m: wanted '
             '16UC1 in mm or 32FC1 in m'
         )
     return depth
@@ -146,12 +148,12 @@ DETECTIONS_INPUT = ImageInput(
     told=True,
 )
 
-# In the order in which images wait for them.
+# The table of inputs, in the order in which images wait for them.
 INPUTS = (MASK_INPUT, KEYPOINTS_INPUT, KEYPOINTS_3D_INPUT, DEPTH_INPUT, PREDICTION_INPUT)
 
 
 class StampedInputs(Generic[T]):
-    """Inputs that belong to the image of exactly their stamp; of several the last counts.
+    """Inputs that wait for the image of exactly their stamp; a later one replaces an earlier one.
 
     None represents an input without content, for example of a detector that saw nobody.
     """
@@ -162,7 +164,7 @@ class StampedInputs(Generic[T]):
         self._content: dict[int, T | None] = {}
 
     def keep(self, first_ns: int, last_ns: int) -> None:
-        """Drops the inputs of other stamps."""
+        """Drops the inputs with stamps outside of a range."""
         kept = self._content.items()
         self._content = {stamp: x for stamp, x in kept if first_ns <= stamp <= last_ns}
 
@@ -173,9 +175,9 @@ class StampedInputs(Generic[T]):
             del self._content[next(iter(self._content))]
 
     def is_settled(self, stamp_ns: int, within_ns: float) -> bool:
-        """Whether the input for an image has come, or one that is later by at most a time.
+        """Whether the input for an image has come, or one that is later by at most `within_ns`.
 
-        An input further ahead does not show that the one of the image is missing.
+        A much later input does not show that the input of the image is missing.
         """
         return any(0 <= each - stamp_ns <= within_ns for each in self._content)
 
@@ -200,14 +202,14 @@ class ImageInputs:
         return self._waiting[name]
 
     def row(self, source: str) -> ImageInput | None:
-        """Return the input that a source belongs to; None if it is no input."""
+        """Return the input that a source belongs to; None if the source is no input."""
         return self._rows.get(source)
 
     def put(self, source: str, message: Any, stamp_ns: int, read: Callable[..., Any]) -> None:
         """Reads a message and keeps its content for its image.
 
         Args:
-            read: reader like `ImageInput.read`.
+            read: reader with the signature of `ImageInput.read`.
         """
         row, content = self._rows[source], None
         try:
@@ -220,11 +222,11 @@ class ImageInputs:
         """Return the input for an image; report a missing input, and inputs without an image.
 
         Args:
-            image: (H, W, 3).
+            image: (H, W, 3) pixels of the image.
             dropped: stamps of dropped images; their inputs are not reported.
 
         Returns:
-            Content for the image; None if there is no message, or one without content.
+            Content for the image; None if there is no message, or if its content is empty.
         """
         taken = self._waiting[row.name].take_all(stamp_ns)
         content = taken.get(stamp_ns)
@@ -232,8 +234,8 @@ class ImageInputs:
             for each in (x for x in taken if x != stamp_ns and x not in dropped):
                 self._log.note(
                     f'{row.name} without an image',
-                    f'{row.name} of {each} ns: no image has this stamp, or waits any more; wanted '
-                    'the stamp of an image',
+                    f'{row.name} of {each} ns: no image with this stamp waits; wanted the stamp '
+                    'of an image',
                 )
         if row.told and stamp_ns not in taken:
             text = f'no {row.name} came for the image of {stamp_ns} ns'
@@ -249,6 +251,6 @@ class ImageInputs:
         return None
 
     def keep(self, first_ns: int, last_ns: int) -> None:
-        """Drops all inputs of other stamps."""
+        """Drops all inputs with stamps outside of a range."""
         for waiting in self._waiting.values():
             waiting.keep(first_ns, last_ns)

@@ -4,12 +4,12 @@ The parameter `source` selects the type of messages: hmt_msgs/Keypoints2D of one
 of other detectors on one person or several:
 
 - Skeleton2D is in units of the image size and needs an earlier camera_info. Its topic belongs to
-  one person. Float32MultiArray without a stamp takes the stamp of the newest camera_info.
-- One of several people is chosen by `person_id`. Without it, the largest person is chosen at first,
-  and then the person nearest to the last position.
+  one person. Float32MultiArray without a stamp gets the stamp of the newest camera_info.
+- `person_id` selects one of several people. Without it, the largest person is chosen at first, and
+  then the person nearest to the last position.
 
-Keypoints without names mean that nobody was seen. Positions in space are added to the keypoints of
-their stamp by name.
+Keypoints without names mean that nobody was seen. Positions in space are matched by name with the
+keypoints of the same stamp.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def _person_of_skeleton(
 ) -> list[DetectedPerson]:
     if camera is None:
         raise MessageError(
-            'it comes before a calibrated camera_info, which tells the size of the image'
+            'it comes before a calibrated camera_info, which gives the size of the image'
         )
     return [person_of_skeleton(message, camera.width, camera.height)]
 
@@ -92,8 +92,8 @@ _READERS: dict[str, Callable[[Any, Scheme, Camera | None], list[DetectedPerson]]
 class ChosenPerson:
     """Chooses the person to follow: the largest at first, then the nearest to the last position.
 
-    The position is that of the detections, so that the choice does not depend on the tracker, whose
-    track may be lost.
+    The last position comes from the detections, not from the tracker, which may have lost the
+    person.
     """
 
     def __init__(self) -> None:
@@ -114,7 +114,7 @@ class ChosenPerson:
             longest_absence: time after which the largest person is chosen again, s.
 
         Returns:
-            The keypoints; None if the person is not among them.
+            The keypoints of the person; None if the person is not in the image.
         """
         seen = [person.keypoints for person in people if person.keypoints.seen.any()]
         if not seen:
@@ -139,7 +139,7 @@ def _size(keypoints: Keypoints) -> float:
 
 
 def _distance(one: Keypoints, other: Keypoints) -> float:
-    """Return the median distance of shared landmarks, or else the distance of the centres, px."""
+    """Return the median distance of shared landmarks or, without any, of the centres, px."""
     both = one.seen & other.seen
     if both.any():
         return float(np.median(elementary.hypot(*(one.pixels - other.pixels)[both].T)))
@@ -163,7 +163,7 @@ class DetectionReader:
         """Return the people in a message.
 
         Args:
-            order: scheme of keypoints without names.
+            order: scheme that gives the order of keypoints without names.
             camera: camera of the image; None: unknown.
 
         Raises:
@@ -229,7 +229,7 @@ class KeypointReader(DetectionReader):
         if self._source == OWN_KEYPOINTS:
             return keypoints_of(message)
         if stamp == 0 and self._source != SKELETON:
-            raise MessageError('it comes before a camera_info, which tells its stamp')
+            raise MessageError('it comes before a camera_info, which gives its stamp')
         people = self._people(message, stamp, p.order, camera)
         chosen: Keypoints | None
         if self._source == SKELETON:
@@ -249,7 +249,7 @@ class KeypointReader(DetectionReader):
         scheme: str,
         stamp_ns: int,
     ) -> Keypoints | None:
-        """Return the keypoints that were seen in an image, possibly none, as joints of the body.
+        """Return the keypoints that were seen in an image, named as joints of the body.
 
         Args:
             found: keypoints as read; None if no message has come.

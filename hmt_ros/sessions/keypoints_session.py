@@ -55,11 +55,11 @@ class KeypointsParameters(ImageNodeParameters):
     """All parameters of the keypoints node.
 
     Attributes:
-        detector: Detector of keypoints; 'mediapipe' is MediaPipe Pose, 'mediapipe+movenet' asks
-            MoveNet Thunder as well, at five times the cost.
+        detector: Keypoint detector: 'mediapipe' (MediaPipe Pose), or 'mediapipe+movenet', which
+            adds MoveNet Thunder at five times the cost.
         publish_mask: If true, the node also publishes the mask of the person.
         people: Maximum number of people whom the node follows and publishes on detections, for
-            people_node; 0: it follows one person, and publishes keypoints.
+            people_node; 0 follows one person and publishes keypoints.
     """
 
     detector: str = parameter_field(USUAL_DETECTOR, NEXT_CONFIGURE)
@@ -80,7 +80,7 @@ class KeypointsParameters(ImageNodeParameters):
 class KeypointsState(SessionState):
     """State of the detection: its status is 'waiting', 'nobody' or 'detecting'.
 
-    The count 'detected' is of images with or without a person, 'empty' of images without one.
+    Counts: 'detected' are all images that were searched, 'empty' the images without a person.
 
     Attributes:
         landmarks: number of landmarks of all people in the last image.
@@ -122,7 +122,7 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
 
     def restart(self) -> None:
         """See `Session`."""
-        # The detector recognises from the stamps that a new sequence begins.
+        # The detector itself recognises a new sequence, from the stamps.
         self._landmarks: int | None = None
         self._count: int | None = None
         super().restart()
@@ -189,7 +189,7 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
 
 
 def detected_people(seen: Sequence[SeenPerson]) -> list[DetectedPerson]:
-    """Convert people for a message."""
+    """Convert the people that a detector has seen to the content of a message."""
     result = []
     for one in seen:
         left, top, right, bottom = one.corners.ravel().tolist()

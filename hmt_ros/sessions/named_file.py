@@ -16,7 +16,7 @@ from hmt_ros.body import model_names
 from hmt_ros.experts import lifter, pose_predictor
 from msg_tools.files.error_line import error_line, one_line
 
-# Parameters that may name a file, and for each the names that are not files.
+# Parameters that may name a file, each with a function that returns the names that are not files.
 FILES: Mapping[str, Callable[[], Collection[str]]] = {
     'subject_file': tuple,
     'background_file': tuple,
@@ -27,7 +27,7 @@ FILES: Mapping[str, Callable[[], Collection[str]]] = {
 
 
 class NamedFileError(ValueError):
-    """A file that a parameter names and that can not be used.
+    """A parameter names a file that can not be used.
 
     Attributes:
         public: parameter, path and kind of the fault; the text of the error may quote the file.
@@ -67,7 +67,8 @@ def check_place(parameter: str, path: str, folders: Collection[str]) -> None:
         folders: folders that may contain the file, after links are resolved.
 
     Raises:
-        ValueError: the file is elsewhere, whether or not it exists, or is not a regular file.
+        ValueError: the file is in none of the folders (whether or not it exists), or is not a
+            regular file.
     """
     names = ['', *FILES[parameter]()]
     if path in names:
@@ -81,7 +82,7 @@ def check_place(parameter: str, path: str, folders: Collection[str]) -> None:
     try:
         regular = stat.S_ISREG(real.stat().st_mode)
     except OSError:
-        hint = f', and no name; there are {", ".join(names[1:])}' if names[1:] else ''
+        hint = f', nor a known name; these are {", ".join(names[1:])}' if names[1:] else ''
         raise ValueError(f'{parameter}: {path}: no such file{hint}') from None
     if not regular:
         raise ValueError(f'{parameter}: {path}: not a regular file')

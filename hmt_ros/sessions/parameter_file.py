@@ -25,10 +25,9 @@ def yaml_scalar(value: Value) -> str:
 
 
 def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -> dict[str, Any]:
-    """Read the parameters that a file gives a node, by name, with dots between groups.
+    """Read the parameters of a node from a file, by name, with dots between groups.
 
-    Sections for other nodes are ignored; a file may also have the parameters alone, without
-    sections.
+    Sections for other nodes are ignored; a file may also contain only parameters, without sections.
 
     Args:
         by_name: whether to use only the sections that name the node, not those for all nodes.

@@ -27,7 +27,7 @@ class Found:
 
     Attributes:
         detected: person as detected.
-        keypoints: keypoints that were seen, at joints of the body.
+        keypoints: seen keypoints, named as joints of the body.
         sighting: position of the person in the image.
     """
 
@@ -65,7 +65,7 @@ class PeopleReader(DetectionReader):
                 self._log.fault(
                     'detections',
                     f'detections of {stamp} ns have the id {person.name!r} twice, wanted each id '
-                    'once: the second is taken to have none',
+                    'once: the second is treated as having none',
                 )
                 people[i] = person._replace(name='')
             names.add(person.name)
@@ -77,7 +77,8 @@ class PeopleReader(DetectionReader):
         """Return the people who are at least partly visible.
 
         Args:
-            use_keypoints: whether keypoints are used for more than the extent of a person.
+            use_keypoints: whether to return keypoints; otherwise they only give the extent of a
+                person.
         """
         result = []
         for person in people:

@@ -1,17 +1,17 @@
-"""Several people before one camera: detections in, one track for each person.
+"""Several people in front of one camera: detections in, one track for each person.
 
-The rules, besides those of `CameraSession`:
+The rules, in addition to those of `CameraSession`:
 
 - An image waits for its detections (`image_inputs`).
-- Identities of the detector are kept. People without one are distinguished by their last position
-  and motion (`hmt_ros.image.association`).
-- A detection that matches no followed person starts a track, the largest first, up to
-  `max_people`. A person without a track, or no longer in view (`Tracker.status`), is dropped.
+- Identities given by the detector are kept. People without an identity are distinguished by their
+  last position and motion (`hmt_ros.image.association`).
+- Detections that match no followed person start tracks, the largest first, up to `max_people`. A
+  person who is no longer in view (`Tracker.status`), or whose track does not begin, is dropped.
 - The nearest person is tracked first. For each person, pixels that a nearer person covers, or that
   only a farther person covers, are unknown (`Tracker.step`, others).
 - The background is learned while nobody is detected, or read from `background_file`.
-- With every image whose detections are known, a list of the tracked people is published, and
-  markers and an overlay with all of them.
+- For every image with known detections, a list of the tracked people is published, together with
+  markers and an overlay that show all of them.
 """
 
 from __future__ import annotations
@@ -85,9 +85,9 @@ def session_of(parameters: FilterParameters) -> type[TrackingSession]:
     return PeopleSession if isinstance(parameters, PeopleParameters) else TrackingSession
 
 
-# Minimum size in the image of a person who is tracked, px.
+# Minimum width and height in the image of a person whose track starts, px.
 SMALLEST = 4
-# Time after which a person who has no track and is no longer detected is dropped, s.
+# Time without a detection after which a person without a track is dropped, s.
 UNSTARTED = 0.5
 
 
@@ -119,10 +119,10 @@ class _Person(Track):
 
     Args:
         found: first detection of the person.
-        stamp: stamp of its image, ns.
+        stamp: stamp of the image of the first detection, ns.
 
     Attributes:
-        known_as: identity from the detector; '' if it has none.
+        known_as: identity given by the detector; '' without one.
         place: track of the person's detections in the image.
     """
 
@@ -154,7 +154,7 @@ class _Person(Track):
         """Pixels (H, W) that the person is expected to cover.
 
         Args:
-            one: detection of the person in the image; None if not detected.
+            one: detection of the person in the image; None if the person was not detected.
         """
         shift = self.place.shift(stamp)
         if one is not None and self.begun and self.tracker is not None:
@@ -170,7 +170,7 @@ class _Person(Track):
 class PeopleSession(TrackingSession):
     """Tracks several people; see `TrackingSession` for arguments and attributes."""
 
-    # Each person also has the topics of `track_messages`, with the prefix of `track`.
+    # Each person also has the topics of `track_messages`, with the prefix from `track.topic_of`.
     TOPICS: ClassVar[Mapping[str, PublishedTopic]] = {
         PEOPLE: PublishedTopic(PEOPLE_2D),
         **{topic: TOPICS_OF_NODE[topic] for topic in ('/tf', MARKERS, OVERLAY)},
@@ -303,7 +303,7 @@ class PeopleSession(TrackingSession):
             left.remove(one)
 
     def _new_name(self, given: str) -> str:
-        """Return an unused identity for topics: letters, digits and underscores, a letter first."""
+        """Return an unused identity that is valid in topics: [A-Za-z] first, then [A-Za-z0-9_]."""
         taken = {track.person for track in self.tracks}
         name = re.sub(r'[^A-Za-z0-9_]', '_', given)
         if name:
@@ -366,7 +366,7 @@ class PeopleSession(TrackingSession):
         self._publish(PEOPLE, stamp, people_message(self._messages, people, stamp, frame))
 
     def _show_people(self, waiting: WaitingImage, camera: Camera) -> None:
-        """Publishes markers and an overlay with all people, where they have subscribers."""
+        """Publishes markers and an overlay with all people, if they have subscribers."""
         if not (self._wanted(MARKERS) or self._wanted(OVERLAY)):
             return
         stamp, frame = waiting.stamp_ns, waiting.frame_id

@@ -2,7 +2,7 @@
 
 Both are computed from the last image that showed the person. While the track is lost or no image
 arrives, the space grows as fast as people move; only an image that shows that nobody is in view
-frees it. Times are those of the stamps, so that the same images give the same bytes.
+frees it. All times are from stamps, so that the same images give the same bytes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MOST_FORECASTS = 100
 
 @dataclass(frozen=True, eq=False)
 class LastSeen:
-    """A track at the last image that showed the person; it is immutable.
+    """State of a track at the last image that showed the person; immutable.
 
     Attributes:
         stamp_ns, frame_id: stamp of the image, ns, and frame of the camera.
@@ -43,8 +43,8 @@ class LastSeen:
         forecaster: forecaster of the track.
         fixed: frame of the outputs; None: the frame of the camera.
         probability: probability that the capsules contain the person.
-        focal_length_sigma: relative standard deviation of the focal length; `posterior` includes
-            it.
+        focal_length_sigma: relative standard deviation of the focal length; `posterior` already
+            includes this error.
     """
 
     stamp_ns: int
@@ -86,7 +86,7 @@ class _Told:
 class RobotOutputs:
     """Makes the outputs for robots.
 
-    `keep_out` and `forecast` may be called by any thread, the others by the estimating thread.
+    `keep_out` and `forecast` are thread-safe; the estimating thread calls the other methods.
     """
 
     def __init__(self) -> None:
@@ -111,14 +111,14 @@ class RobotOutputs:
         Args:
             stamp_ns, frame_id: stamp of the image, ns, and frame of the outputs.
             existence: probability that a person is in view; NaN: unknown.
-            seen: the track, if the image shows the person; None: the last one is kept.
+            seen: state of the track, if the image shows the person; None: the last state is kept.
             reason: reason of the state, see `KeepOut`.
         """
         before = self._told.seen
         if state is KeepOutState.NOBODY:
             before = None
         elif state is KeepOutState.UNKNOWN and before is not None:
-            # A track was dropped; its person may have moved.
+            # The track was dropped, but its person may still be there.
             state = KeepOutState.LOST
         self._told = _Told(state, stamp_ns, frame_id, track_id, existence, seen or before, reason)
 
@@ -127,7 +127,8 @@ class RobotOutputs:
 
         Args:
             probability: requested probability; reported if there are no capsules.
-            silence: time since the newest image was answered, s; None: it is being answered.
+            silence: time since the outputs for the newest image were published, s; None: they are
+                published now.
         """
         told = self._told
         seen, state, stamp, reason = told.seen, told.state, told.stamp_ns, told.reason
@@ -158,7 +159,8 @@ class RobotOutputs:
         """Return the forecast of the pose at a time after the newest image.
 
         Raises:
-            ValueError: nobody is tracked, or the time is before the image or long after.
+            ValueError: nobody is tracked, or the time is before the newest image or more than
+                `LONGEST_FORECAST` after it.
         """
         told = self._told
         seen = told.seen
@@ -189,10 +191,10 @@ class RobotOutputs:
         )
 
     def due(self, rate: float, horizon: float) -> Iterable[int]:
-        """Return the grid times, ns, within the horizon of the newest image but of none before.
+        """Return the grid times, ns, that have newly come within the horizon of the newest image.
 
         Args:
-            rate: grid times per second; 0: none.
+            rate: number of grid times per second; 0: no grid times.
             horizon: maximum time from an image to a forecast, s.
         """
         told = self._told

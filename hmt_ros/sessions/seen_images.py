@@ -11,13 +11,13 @@ import numpy as np
 
 from hmt_ros.image.image_sequence import SeenImage
 
-# Maximum memory of the images of a window, MB; 47 images of 640 x 480 pixels, which the person
-# fills, take 80 MB.
+# Maximum memory of the images of a window, MB; 47 images of 640 x 480 pixels that the person fills
+# take 80 MB.
 MOST_MB = 256
 
 
 class SeenImages:
-    """Images by stamp; any thread may call the methods.
+    """Thread-safe store of images by stamp.
 
     Args:
         most_mb: maximum memory of the images, MB; the oldest are dropped first.
@@ -32,9 +32,9 @@ class SeenImages:
         self._lock = threading.Lock()
 
     def add(self, stamp_ns: int, image: SeenImage | None) -> None:
-        """Keeps the evidence of an image; None if it shows nobody.
+        """Keeps the evidence of an image; ignores None, which means that it shows nobody.
 
-        Kept images that are not older belong to another time and are dropped.
+        Kept images that are not older are from before a jump in time, and are dropped.
         """
         if image is None:
             return

@@ -1,10 +1,10 @@
 """Base class of sessions, which hold the logic of a node: messages in, messages out, without ROS.
 
 A node and an offline replay pass their messages to a session; the same messages in the same order
-give the same bytes. Messages that are estimated from are used in the order of their stamps
-(`stamp_order`): a message that is far ahead of the previous ones, or older, waits until others
-agree with it. If they agree on an older time, the estimate restarts. Messages that can not be used
-are skipped. The first fault of each kind is logged; all are counted.
+give the same bytes. Messages that trigger estimates are used in the order of their stamps
+(`stamp_order`): a message that is far ahead of the previous ones, or older, waits until other
+messages confirm its time. If they confirm an older time, the estimate restarts. Messages that can
+not be used are skipped. The first fault of each kind is logged; all are counted.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from msg_tools import MessageError, RosbagsMessages
 from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.images import decode_image
 
-# Prefix, before the name of a topic, of the diagnostics key for its number of subscribers.
+# Prefix of the diagnostics key for the number of subscribers of a topic.
 SUBSCRIBERS = 'subscribers of '
 FINISH = 'finish'  # source of the report of `finish`, at the end of the stream
 TIME_JUMP = 'time jumps back'  # kind of fault
@@ -42,7 +42,7 @@ class PublishedTopic(NamedTuple):
     """A topic of a node; bags use the same name and type.
 
     Attributes:
-        msgtype: for example 'hmt_msgs/msg/PoseMixture'.
+        msgtype: message type, for example 'hmt_msgs/msg/PoseMixture'.
         latched: whether late subscribers get the last message.
     """
 
@@ -55,7 +55,7 @@ class NeededInput(NamedTuple):
 
     Attributes:
         sources: sources of the input; one of them is enough.
-        with_each: whether every message that is estimated from needs such an input.
+        with_each: whether every message that triggers an estimate needs this input.
     """
 
     sources: tuple[str, ...]
@@ -67,15 +67,15 @@ class SessionState(ABC):
     """State of a session, for diagnostics.
 
     Attributes:
-        status: in a word or two; see the sessions.
+        status: one of the words that the state class of the session lists.
         wants: input that the next step waits for; '' while it works.
         entropy: entropy of the weights of the present mixture, nats; NaN without a mixture.
-        counts: numbers of messages that are estimated from: 'received', and of these 'skipped',
-            'dropped' and keys of the session.
+        counts: numbers of messages that trigger estimates, by outcome: 'received', 'skipped',
+            'dropped', and keys of the session.
         faults: number of faults by kind.
         last_fault: newest fault; '' before the first.
-        held_up: input that the last dropped message waited for; '' if it waited for its turn only.
-        frame_id: frame of the newest message that is estimated from; '' before the first.
+        held_up: input that the last dropped message waited for; '' if the node was only late.
+        frame_id: frame of the newest message that triggers an estimate; '' before the first.
         time_jump: report on the last step back of the clock; '' before the first.
     """
 
@@ -124,30 +124,31 @@ State = TypeVar('State', bound=SessionState)
 class Session(ABC, Generic[Parameters, State]):
     """Handles the messages of a node or a replay, one after the other.
 
-    All methods must be called by one thread, unless they say otherwise; `state` and `parameters`
-    may be read, and `parameters` replaced, by other threads.
+    Methods that are not documented as thread-safe must be called by one thread. Other threads may
+    read `state` and `parameters`, and replace `parameters`.
 
     Args:
         parameters: parameters of the node.
-        publish: takes each message to be published, as soon as it is made.
-        wanted: returns whether a topic needs to be published.
+        publish: function that is called with each output as soon as it is made.
+        wanted: function that returns whether a topic needs to be published.
 
     Raises:
         ValueError: the parameters name something that can not be used.
 
     Attributes:
         TOPICS: the topics that are published.
-        COUNTED: source of the messages that are estimated from, or the kind of several sources, see
+        COUNTED: source of the messages that trigger estimates, or the kind of several sources, see
             `kind_of`.
-        UNIT: name of such a message.
+        UNIT: word for one message of `COUNTED`, such as 'image'.
         DONE: key of `SessionState.counts` for the messages that were used.
         ESTIMATE: name of the estimate that restarts when time jumps back.
         CHECKED: parameters whose values only a new session can check, for example names of files.
-        parameters: parameters; a new value takes effect as `declared_parameters` says.
-        interrupted: returns whether messages have arrived during an estimate; a node sets it.
+        parameters: present parameters; `declared_parameters` says when a new value takes effect.
+        interrupted: function, set by a node, that returns whether messages have arrived during an
+            estimate.
         state: present state; replaced with every message.
-        topic_names: full names of the topics by source, for faults; empty without topics.
-        decode_image: decodes the image of a message; a node shares it with others of its process.
+        topic_names: full names of the topics by source, for texts of faults; empty without topics.
+        decode_image: function that decodes the image of a message; nodes of a process share it.
         publishing: time spent on serialising and publishing messages, s; for diagnostics.
     """
 
@@ -174,7 +175,7 @@ class Session(ABC, Generic[Parameters, State]):
         self._log = HandlingLog()
         self._frame_id = ''
         self._time_jump = ''
-        # Order of the messages that are estimated from, by source.
+        # Order of the messages that trigger estimates, by source.
         self._orders: dict[str, StampOrder] = {}
         self.topic_names: Mapping[str, str] = {}
         self.decode_image: Callable[[Any], Image] = decode_image
@@ -182,10 +183,10 @@ class Session(ABC, Generic[Parameters, State]):
         self._set_up()
 
     def _set_up(self) -> None:
-        """Creates the attributes of a kind of session; raises ValueError as the class does."""
+        """Creates the attributes of a subclass; raises ValueError if parameters are unusable."""
 
     def share(self, images: SeenImages) -> None:
-        """Sets the image store of the process; is called before the first message."""
+        """Sets the image store of the process; called before the first message."""
 
     @property
     def most_waiting(self) -> int:
@@ -196,9 +197,9 @@ class Session(ABC, Generic[Parameters, State]):
         """Handles a message.
 
         Args:
-            source: a source that the module of the session names.
-            message: of the type of the source, from `rosbags` or ROS.
-            more: whether another message waits already; work that can wait is left for it.
+            source: source of the message, as named in the module of the session.
+            message: message of `rosbags` or of ROS.
+            more: whether another message is waiting already; work is then postponed if possible.
         """
         try:
             stamp = self._stamp_of(source, message)
@@ -219,7 +220,7 @@ class Session(ABC, Generic[Parameters, State]):
         return self._handled(source, stamp)
 
     def needed_inputs(self) -> list[NeededInput]:
-        """Inputs that are needed at present; may be called by any thread."""
+        """Inputs that are needed at present. Thread-safe."""
         return [NeededInput((self.COUNTED,))]
 
     def restart(self) -> None:
@@ -256,7 +257,7 @@ class Session(ABC, Generic[Parameters, State]):
         """Counts an error of the session itself, and restarts the estimate."""
         self._log.fault('node itself', text)
         self.restart()
-        # The error is in the log of the node already.
+        # The node has already logged the error.
         return replace(self._log.handled(source, 0), warnings=())
 
     def count_dropped(self, messages: int) -> None:
@@ -282,7 +283,7 @@ class Session(ABC, Generic[Parameters, State]):
         """Return the present state."""
 
     def _is_counted(self, source: str) -> bool:
-        """Whether the messages of a source are estimated from."""
+        """Whether the messages of a source trigger estimates."""
         return kind_of(source) == self.COUNTED
 
     def _stamp_of(self, source: str, message: Any) -> int:
@@ -312,7 +313,7 @@ class Session(ABC, Generic[Parameters, State]):
         return f'{source} on {topic}' if topic else source
 
     def _turn_of(self, source: str, one: Stamped) -> Turn:
-        """Put a message in order; return the messages to use; restart if time jumps back."""
+        """Add a message to the order; return the messages to use; restart if time jumps back."""
         order = self._orders.setdefault(source, StampOrder())
         if len(self._orders) > _MOST_STREAMS:
             del self._orders[next(iter(self._orders))]
@@ -336,11 +337,11 @@ class Session(ABC, Generic[Parameters, State]):
         return turn
 
     def _use(self, source: str, turn: Turn) -> None:
-        """Uses the messages of a source whose turn has come."""
+        """Uses the messages of a source that are next in order."""
         for stray, _ in turn.stray:
             text = f'{self.UNIT} of {stray} ns is left out: its stamp is far from those of others'
             self._log.counts['skipped'] += 1
-            # No fault of the message that is handled now.
+            # This is not a fault of the present message.
             self._log.note('stray stamp', text)
         for one in turn.use:
             skipped = self._log.counts['skipped']
@@ -352,8 +353,8 @@ class Session(ABC, Generic[Parameters, State]):
         """Restarts the estimate after time has jumped back.
 
         Args:
-            first, last: first and last stamp of the messages after the jump, which are used next,
-                ns.
+            first, last: first and last stamp, ns, of the messages after the jump, which are used
+                next.
         """
         self.restart()
 

@@ -1,4 +1,4 @@
-"""Messages about a smoothed window; `track_messages` has those about a tracked image."""
+"""Messages about a smoothed window; for a tracked image see `track_messages`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from msg_tools.messages.states import heaviest_joint_state, transforms_message
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture as TrajectoryContent
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 
-# In the order in which they are published.
+# Topics, in the order in which they are published.
 TOPICS = {
     'trajectory_mixture': PublishedTopic('hmt_msgs/msg/TrajectoryMixture'),
     'trajectory_markers': PublishedTopic('visualization_msgs/msg/MarkerArray'),
@@ -35,13 +35,13 @@ TOPICS = {
     '/tf': PublishedTopic('tf2_msgs/msg/TFMessage'),
 }
 TRACED = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')
-# Maximum number of trajectories that are drawn, the heaviest.
+# Maximum number of trajectories that are drawn, heaviest first.
 DRAWN = 8
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothedBody:
-    """The person of the poses.
+    """The person whose poses are smoothed.
 
     Attributes:
         body: body with its present lengths.
@@ -59,7 +59,7 @@ class OpenPose(NamedTuple):
 
     Attributes:
         state: state of the track in the filter.
-        existence: probability that a person is in view, by the filter; NaN: unknown.
+        existence: probability, from the filter, that a person is in view; NaN: unknown.
         shape: (d, d) covariance of the errors shared by poses of all images; None: unknown.
     """
 
@@ -177,7 +177,7 @@ def with_shape(mixture: GaussianMixture, shape: Array | None) -> GaussianMixture
 def nobody_messages(
     of: SmoothedBody, stamp_ns: int, existence: float, wanted: Callable[[str], bool]
 ) -> Iterator[tuple[str, Any]]:
-    """Yields topics and messages at a time from which nobody is in view.
+    """Yields topics and messages that say that nobody is in view any more.
 
     Args:
         of: person of the previous poses.

@@ -21,26 +21,27 @@ class SmootherParameters(NodeParameters):
     """All parameters of the smoother node.
 
     Attributes:
-        body_model: Body model, a name or a YAML file, where the name in the mixtures is not a known
-            one; if empty, that name.
-        fixed_lag: Time by which a smoothed pose is older than the newest image, s, at any rate of
-            images. It may be a fifth more; 0 is filtering.
+        body_model: Body model, a name or a YAML file, that replaces the one named in the mixtures;
+            if empty, the mixtures must name a known model.
+        fixed_lag: Time by which a smoothed pose lags the newest image, s, at any image rate; it may
+            be up to a fifth longer. 0 selects filtering.
         window_length: Number of the newest mixtures that are kept for ~/smooth_window.
         refine_on_images: When up to four distinct motions of the last window_length mixtures are
-            refined on the images themselves, 'never', 'asked' (in the answers of ~/smooth_window)
-            or 'end' (at the end of the stream as well, which then publishes them on
-            trajectory_mixture). It takes seconds, and 256 MB at most. The filter must be in the
-            same process (person_node, replay) and publish in the frame of the camera.
-        max_hypotheses: Maximum number of motions, the components of both mixtures.
-        resting_feet: If true, feet that rest do not slide between images. The frame of the mixtures
-            must then stand still (a still camera, or publish_in_fixed_frame of the filter).
-        random_seed: Seed of all random numbers; the same mixtures give the same results.
-        publish_covariances: If true, trajectory_mixture has covariances, which make it forty times
-            as large.
+            refined on the images: 'never', 'asked' (for the answers of ~/smooth_window) or 'end'
+            (also at the end of the stream, with the result on trajectory_mixture). Refinement takes
+            seconds, and 256 MB at most. The filter must run in the same process (person_node,
+            replay) and publish in the camera frame.
+        max_hypotheses: Maximum number of motions, the components of smoothed_pose_mixture and
+            trajectory_mixture.
+        resting_feet: If true, resting feet do not slide between images. The frame of the mixtures
+            must then be still (a still camera, or publish_in_fixed_frame of the filter).
+        random_seed: Seed of all random numbers; the same mixtures and seed give the same results.
+        publish_covariances: If true, trajectory_mixture includes covariances, which make it forty
+            times as large.
         publish_tf: If true, the links of the heaviest smoothed pose are published on /tf.
-        frame_prefix: Prefix of the names of these links, beside those of the filter.
-        queue_size: Maximum number of mixtures that wait, while ~/smooth_window is answered for
-            example; the oldest are dropped.
+        frame_prefix: Prefix of the link names of the smoothed pose on /tf.
+        queue_size: Maximum number of mixtures that wait, for example during ~/smooth_window; the
+            oldest are dropped.
     """
 
     body_model: str = parameter_field('', NEXT_WINDOW)

@@ -1,28 +1,28 @@
 """Session of the smoother: likelihood mixtures in, smoothed poses and trajectories out.
 
-The rules, besides those of `Session`:
+The rules, in addition to those of `Session`:
 
-- Mixtures are smoothed in the order of their stamps, in a sliding window, at most every 0.1 s, or
-  every fifth of `fixed_lag` if that is shorter: neighbouring results hardly differ. A smoothed pose
-  is published before it is older than the newest by more than 1.2 times `fixed_lag`. Poses that are
-  still open when the window ends are published then: at the end of the stream (`finish`), when
+- Mixtures are smoothed in the order of their stamps, in a sliding window. As neighbouring results
+  hardly differ, this is done at most every 0.1 s, or every fifth of `fixed_lag` if that is shorter.
+  A smoothed pose is published while it is at most 1.2 times `fixed_lag` older than the newest one.
+  When a window ends, its unpublished poses are published: at the end of the stream (`finish`), when
   time jumps back, and at a new body.
 - A mixture names its body and carries the segment lengths of the person; without them the lengths
   of the model apply. Another body, a jump of the lengths, another frame or another track_id means
   a new track and starts a new window. Slow changes of the lengths refine their estimate.
 - A likelihood without components means that nobody is in view: the window ends, and a smoothed
   mixture without components is published, with markers that remove the earlier ones.
-- The chain of the filter's modes, which likelihoods carry (`posterior_weight`, `ancestry`), alone
+- Likelihoods carry the chain of the filter's modes (`posterior_weight`, `ancestry`), which alone
   determines the weights of motions. Without it, a mode may continue every mode within reach.
-- Errors of consecutive images are correlated, by the error model that a likelihood carries and the
-  time between the images (`error_model`). A likelihood without an error model is skipped; so is a
-  forecast, which is no evidence.
+- Errors of consecutive images are correlated, according to the error model of the likelihood and
+  the time between the images (`error_model`). A likelihood without an error model is skipped; so is
+  a forecast, because it contains no evidence.
 - The uncertainty of the person's shape is the same in all images. It is added once, to the
   covariances that are published.
 - Near the limits of the root's angles, for example with a camera on its side, mixtures are smoothed
-  in the frame of a camera that is rotated by quarter turns; a new window begins then.
+  in the frame of a camera that is rotated by quarter turns; this begins a new window.
 - Cyclic angles are unwrapped from mixture to mixture, each mode relative to the nearest previous
-  mode: to the dynamics a whole turn would be a jump.
+  mode, because the dynamics would treat a whole turn as a jump.
 - The dynamics bridge gaps. Gaps longer than `LONGEST_INTERVAL` are reported.
 """
 
@@ -73,12 +73,12 @@ MIXTURE, TRAJECTORIES = 'likelihood_mixture', 'trajectory_mixture'
 NOBODY = 'nobody'  # status while nobody is in view
 # Maximum change of a segment length between two mixtures of the same person, m.
 SAME_PERSON = 0.02
-# Minimum time between two smoothings: as a fraction of the lag, but not more than RARELY, s.
+# Minimum time between two smoothings: SHARE_OF_LAG times the lag, but at most RARELY, s.
 SHARE_OF_LAG, RARELY = 0.2, 0.1
 # Maximum interval between two mixtures that is not reported as a gap, s.
 LONGEST_INTERVAL = 0.25
-# Factor on the diffusion of the filter's motion prior. Sudden motion is more frequent than under
-# a Gaussian of the mean variance; chosen on clips (docs/smoothing.md).
+# Factor on the diffusion of the filter's motion prior, chosen on clips (docs/smoothing.md): sudden
+# motion is more frequent than a Gaussian with the mean variance predicts.
 LIVELINESS = 2.0
 
 
@@ -103,7 +103,7 @@ class SmootherState(SessionState):
         return f'{self.trajectories} trajectories of {self.window} poses'
 
     def trouble(self) -> str:
-        """Return 'nobody in view' if so, else ''."""
+        """Return 'nobody in view', or '' if somebody is in view."""
         return 'nobody in view' if self.status == NOBODY else ''
 
     def values(self) -> list[tuple[str, str]]:
@@ -124,7 +124,7 @@ def untold(text: str) -> None:
 class SmootherSession(Session[SmootherParameters, SmootherState]):
     """Smooths the poses of one person; see `Session` for arguments and attributes.
 
-    `smooth_span` may be called by any thread.
+    `smooth_span` is thread-safe.
 
     Attributes:
         kept: newest likelihoods of the window, for `smooth_span`.
@@ -197,15 +197,15 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         if content.kind in (MixtureKind.POSTERIOR, MixtureKind.SMOOTHED):
             self._log.note(
                 'kind of mixture',
-                f'mixtures are of the kind {content.kind.name}, wanted LIKELIHOOD: what the images '
-                'say counts more than once',
+                f'mixtures are of the kind {content.kind.name}, wanted LIKELIHOOD: the evidence '
+                'of the images is counted more than once',
             )
         if content.posterior_weights is None:
             self._log.note(
                 'ancestry',
-                'mixtures do not tell posterior weights and ancestry of their components, as those '
-                'of the filter do: their weights are taken, and a component continues all of the '
-                'mixture before that are within reach',
+                'mixtures have no posterior weights and ancestry of their components, unlike '
+                'those of the filter: their weights are used, and a component may continue '
+                'every component of the previous mixture within reach',
             )
         self._begin_track(of)
         self._want_images()
@@ -218,7 +218,8 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 self._longest_gap = max(self._longest_gap, interval)
                 self._log.note(
                     'gap',
-                    f'no mixture for {interval:.2f} s before {stamp} ns: the dynamics bridge it',
+                    f'no mixture for {interval:.2f} s before {stamp} ns: the dynamics bridge the '
+                    'gap',
                 )
         if self._window is None:
             self._window = SlidingWindow(
@@ -275,7 +276,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 self._publish(topic, stamp, made)
 
     def _whose(self, content: PoseMixture) -> SmoothedBody:
-        """Return the person of a mixture: the same object while the person does not change.
+        """Return the person of a mixture; it is the same object while the person does not change.
 
         Raises:
             MessageError: the body is unknown, or not the one that the parameters name.
@@ -301,7 +302,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         return of
 
     def _clear(self, of: SmoothedBody, mixture: GaussianMixture) -> SmoothedBody:
-        """Return the person with a level that keeps the heaviest pose far from the poles."""
+        """Return the person, levelled so that the root angles of the heaviest pose avoid poles."""
         heaviest = mixture[np.array([np.argmax(mixture.weights)])]
         seen = relevelled(of.body.levelled(np.eye(3)), heaviest, of.body)
         level = clear_level(of.body, seen.means[0])
@@ -313,20 +314,20 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         return of
 
     def _begin_track(self, of: SmoothedBody) -> None:
-        """Sets the person; ends the window if it is another person's."""
+        """Sets the person; ends the window if it belongs to another person."""
         known = self._of
         if known is not None and _same(known, of):
             self._of = of
             return
         if self._newest is not None:
-            text = 'mixtures are about another body or another track: a new window begins'
+            text = 'mixtures belong to another body or another track: a new window begins'
             self._log.note('new body', text)
         self._end_window()
         self._of, self._first_identity = of, 1
         self.kept = KeptMixtures(of, ())
 
     def _smoother(self, body: Body) -> MotionSmoother:
-        """Return a smoother with the settings of the parameters."""
+        """Return a smoother configured by the parameters."""
         p = self.parameters
         prior = motion_prior(body)
         return MotionSmoother(
@@ -341,7 +342,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     def _end_window(self) -> None:
         """Publishes the poses that are still open, and forgets the window."""
         if self._window is not None and self._of is not None:
-            # A track may continue in another window.
+            # The track may continue in the next window, whose identities must differ.
             self._first_identity = self._window.next_identity
             for pose in self._window.finish():
                 self._publish_final(pose, self._of)
@@ -365,11 +366,13 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     ) -> Any:
         """Smooths the kept mixtures of a span of time, all at once.
 
-        May be called by any thread, at any time.
+        Thread-safe.
 
         Args:
-            from_ns, to_ns: first and last stamp, inclusive; 0: the oldest and the newest.
-            tell: called with a line that says whether images refined the motions or why not.
+            from_ns, to_ns: first and last stamp, inclusive, ns; 0 selects the oldest and the newest
+                mixture.
+            tell: function that is called with a line that says whether images refined the motions,
+                or why they did not.
 
         Returns:
             hmt_msgs/TrajectoryMixture with covariances.
@@ -441,7 +444,7 @@ def _chosen_body(model: str) -> Body:
 
 
 def _levelled(evidence: Evidence, body: Body) -> Evidence:
-    """Convert evidence with root angles relative to the camera to the level of a body."""
+    """Convert evidence from root angles relative to the camera to those of a levelled body."""
     camera = body.levelled(np.eye(3))
     if camera is body:
         return evidence
@@ -454,12 +457,12 @@ def _levelled(evidence: Evidence, body: Body) -> Evidence:
 
 
 def _shapes(items: Iterable[tuple[int, Array | None]]) -> dict[int, Array]:
-    """Return the known covariances of shapes, by stamp."""
+    """Return the covariances of shape errors that are known, by stamp."""
     return {stamp: shape for stamp, shape in items if shape is not None}
 
 
 def _same(one: SmoothedBody, other: SmoothedBody) -> bool:
-    """Whether two bodies belong to one person, whose length estimates may change slowly."""
+    """Whether two bodies belong to one person; length estimates of a person change slowly."""
     same_track = 0 in (one.track_id, other.track_id) or one.track_id == other.track_id
     return (
         same_track

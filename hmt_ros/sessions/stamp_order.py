@@ -1,4 +1,4 @@
-"""The order of the messages of a stream, by their stamps; one stray stamp changes nothing.
+"""Order of the messages of a stream by their stamps, unaffected by single stray stamps.
 
 A message that is older than the previous one, or far ahead of it, is put aside. Once several
 messages in a row agree on the later or earlier time, all of them are used: the source has paused,
@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 
 from msg_tools.messages.headers import SECOND_NS
 
-# Number of messages in a row that confirm another time, and minimum step back of a clock, ns: the
-# stream soon makes up for a shorter step. EXPECTED applies if the clock may go back.
+# Number of messages in a row that confirm another time, and minimum step back of a clock, ns: a
+# stream soon catches up with a shorter step. EXPECTED is used if the clock may go back.
 AGREEING, EXPECTED = (3, SECOND_NS), (2, 0)
-# Minimum step ahead that other messages must confirm, ns, and in intervals of the stream.
+# Maximum step ahead without confirmation by other messages, ns, and in intervals of the stream; the
+# larger one applies.
 _AHEAD_NS, _INTERVALS = SECOND_NS, 5
 
 
@@ -26,13 +27,13 @@ class Stamped(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """Messages whose turn has come.
+    """Outcome of the arrival of a message.
 
     Attributes:
         use: messages to use now, in their order.
         stray: messages that were put aside and are not used.
         late: whether the new message is skipped, as it is not newer than earlier ones.
-        back: time by which the clock went back before the first of `use`, ns.
+        back: time by which the clock went back before the first of `use`, ns; 0: it did not.
     """
 
     use: tuple[Stamped, ...] = ()
@@ -45,8 +46,8 @@ class StampOrder:
     """The order of one stream.
 
     Attributes:
-        newest: stamp of the newest message that could be used, ns, set by the caller that uses
-            them; None before the first.
+        newest: stamp of the newest message that could be used, ns, set by the caller; None before
+            the first.
     """
 
     def __init__(self) -> None:
@@ -55,7 +56,7 @@ class StampOrder:
         self._aside: tuple[Stamped, ...] = ()
 
     def put(self, one: Stamped, *, expected: bool) -> Turn:
-        """Puts the next message in order.
+        """Adds the next message; returns the messages that can now be used.
 
         Args:
             expected: whether the clock may go back, for example when a bag is played again.

@@ -1,9 +1,10 @@
-"""The track of one person before a camera: images in, mixtures over poses out.
+"""The track of one person in front of a camera: images in, mixtures over poses out.
 
 If several people are tracked, each has topics in `humans/bodies/<id>/` (REP 155), and link frames
-that begin with `body_<id>/`; a person without a name has neither. When the person is no longer in
-view, one mixture of each kind without components is published, with markers that remove the earlier
-ones, and then nothing until a new track starts. Outputs for robots are published for every image.
+that begin with `body_<id>/`; for a single person there are no such prefixes. When the person is no
+longer in view, one mixture of each kind without components is published, with markers that remove
+the earlier ones, and then nothing until a new track starts. Outputs for robots are published for
+every image.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ _STATES = {
 
 
 def topic_of(person: str, topic: str) -> str:
-    """Return a person's topic; absolute topics are shared, and a person '' has no namespace."""
+    """Return a topic with the prefix of a person; no prefix for absolute topics or person ''."""
     return f'{BODIES}/{person}/{topic}' if person and not topic.startswith('/') else topic
 
 
@@ -70,14 +71,14 @@ class Shared:
     """Objects that the tracks of a session share.
 
     Attributes:
-        frames: frames related to the camera by transforms.
+        frames: frames that transforms relate to the camera.
         log: log of the session.
-        publish: takes topic, stamp and message.
-        wanted: returns whether a topic needs to be published.
-        answering: lock on the outputs for robots, so that an output of the watchdog never follows
-            the answer to a newer image.
-        answered: number of images that were answered for robots.
-        seen_images: evidence on the only person, in the frame of the camera, for a smoother.
+        publish: function that publishes a message, called with topic, stamp in ns, and message.
+        wanted: function that returns whether a topic needs to be published.
+        answering: lock on the outputs for robots, so that the watchdog never publishes after the
+            outputs for a newer image.
+        answered: number of images for which outputs for robots were published.
+        seen_images: store of image evidence on a single person, camera frame, for a smoother.
     """
 
     frames: CameraFrames
@@ -90,12 +91,12 @@ class Shared:
 
 
 class Seen(NamedTuple):
-    """Evidence on a person in an image, besides the image itself; see `Tracker.step`.
+    """Evidence on a person that accompanies an image; see `Tracker.step`.
 
     Attributes:
-        keypoints: keypoints of the person that were seen; None: the detector has not answered.
+        keypoints: detected keypoints of the person; None: the detector has given no result.
         prediction: prediction of the pose, or `Status.NOBODY`; None without a prediction.
-        others: (H, W) pixels that other people cover; None: none.
+        others: (H, W) mask of the pixels that other people cover; None: no such pixels.
     """
 
     keypoints: Keypoints | None
@@ -104,19 +105,20 @@ class Seen(NamedTuple):
 
 
 class Track:
-    """Tracks one person; only `stale` may be called by other threads than the estimating one.
+    """Tracks one person; only `stale` is thread-safe.
 
     Args:
-        person: identity, which is part of topics and frames; '': the only person.
-        parameters: parameters of the node; each image may replace them.
-        background: background that several people share, learned elsewhere; None: its own.
+        person: identity of the person, used in names of topics and frames; '' for a single person.
+        parameters: parameters of the node; `follow` replaces them.
+        background: background that several tracks share and that is learned elsewhere; None: the
+            track learns its own.
 
     Attributes:
-        person: identity.
-        start: start of the track.
+        person: identity of the person.
+        start: data that the track starts from.
         tracker: the tracker; None before the first image after a restart.
-        body: body that was published last; None before the first after a restart.
-        weights: weights of the present mixture; empty if missing.
+        body: body that was published last; None if no body was published since the restart.
+        weights: weights of the present mixture; empty without a mixture.
         robot: outputs for robots; may be read by any thread.
     """
 
@@ -136,7 +138,7 @@ class Track:
         self._described: tuple[str, str] | None = None
         self.restart(start)
         for topic in TOPICS_OF_NODE if person else ():
-            # Creates the publishers now: a message right after their creation would be lost.
+            # Creates the publishers early, as messages right after their creation would be lost.
             self._wants(topic)
 
     def restart(self, start: TrackStart) -> None:
@@ -160,7 +162,7 @@ class Track:
 
     @property
     def begun(self) -> bool:
-        """Whether there is a track."""
+        """Whether there is a track, possibly a lost one."""
         return self.status in (Status.TRACKING, Status.LOST)
 
     def follow(
@@ -205,7 +207,7 @@ class Track:
             elif len(self.weights):
                 self._publish_nobody(tracker, waiting)
             if not starts and tracker.estimate.status is Status.WAITING:
-                # The track may have been of something else than a person.
+                # The track may have followed something other than a person.
                 self.robot.forget()
             answered = True
             self._answer_robot(waiting, tracker, posterior)
@@ -216,23 +218,23 @@ class Track:
             if not starts:
                 log.fault('estimate', f'image of {stamp} ns can not be tracked: {text}')
                 return False
-            # The next image would fail in the same way, and take the same time.
+            # With the same start, the next image would fail in the same way.
             log.fault('start', f'no track starts at the image of {stamp} ns: {text}')
             self.restart(replace(self.start, background=None, initial=None, box=None))
             return False
         return published
 
     def stale(self, silence: float) -> Iterator[Output]:
-        """Yields messages for a robot while no image is answered; may be called by any thread.
+        """Yields messages that tell robots that the estimate is old. Thread-safe.
 
         Args:
-            silence: time since the newest image was answered, s.
+            silence: time since the outputs for the newest image were published, s.
         """
         for made in robot_messages(self.robot, self._parameters, self._wants, silence):
             yield replace(made, topic=topic_of(self.person, made.topic))
 
     def _placed_tracker(self, camera: Camera) -> Tracker:
-        """Return the tracker, with gravity and the pose of the camera at the image.
+        """Return the tracker, with gravity and pose of the camera set for the present image.
 
         Raises:
             ValueError: no tracker can start.
@@ -335,7 +337,7 @@ class Track:
             if tracker.estimate.status is Status.WAITING and self.start.initial is not None:
                 reason = f'waiting for {self.start.wants(())}'
             if state is KeepOutState.NOBODY and not tracker.estimate.nobody_shown:
-                # An earlier image showed that nobody is there; this one shows nothing.
+                # An earlier image showed that nobody is there; this one gives no evidence.
                 state = KeepOutState.UNKNOWN
             elif state is KeepOutState.TRACKING:
                 if placed and posterior is not None and not tracker.estimate.foreseen:

@@ -1,7 +1,7 @@
 """Messages about a tracked image.
 
-`TOPICS` has names and types; the functions are generators that make one message at a time. A
-message depends on the track and the image alone.
+`TOPICS` lists the names and types of the topics. The functions are generators that make one message
+at a time. A message depends only on the track and the image.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ from msg_tools.messages.pose_mixtures import (
 from msg_tools.messages.states import joint_state_message, transforms_message
 from msg_tools.messages.urdf import link_frames
 
-# In the order in which they are published.
+# Topics, in the order in which they are published.
 TOPICS = {
     'body': PublishedTopic('hmt_msgs/msg/Body', latched=True),
-    # Never robot_description: without a namespace that would be the robot's own.
+    # Not robot_description, which without a namespace is the description of the robot itself.
     'human_description': PublishedTopic('std_msgs/msg/String', latched=True),
     'pose_mixture': PublishedTopic('hmt_msgs/msg/PoseMixture'),
     'likelihood_mixture': PublishedTopic('hmt_msgs/msg/PoseMixture'),
@@ -60,16 +60,16 @@ TOPICS = {
     'keep_out': PublishedTopic(KEEP_OUT),
     'pose_forecast': PublishedTopic('hmt_msgs/msg/PoseMixture'),
 }
-# Not in bags: keep_out_markers are large, and follow from keep_out.
+# Bags omit keep_out_markers, which are large and can be computed from keep_out.
 TOPICS_OF_NODE = {
     **TOPICS,
     'keep_out_markers': PublishedTopic('visualization_msgs/msg/MarkerArray'),
 }
 
-# Name, after a prefix, of the frame at the camera with x forward and z up, if gravity is known.
+# Name, without prefix, of the frame at the camera with x forward and z up; requires gravity.
 UPRIGHT = 'camera_upright'
 MESSAGES = RosbagsMessages()
-# Maximum number of modes drawn on the image, the heaviest.
+# Maximum number of modes drawn on the image, heaviest first.
 OVERLAY_MODES = 3
 
 
@@ -79,12 +79,12 @@ class TrackedImage:
 
     Attributes:
         waiting: the image.
-        tracker: the tracker after the image.
+        tracker: the tracker, updated from the image.
         posterior, likelihood: mixtures over poses, heaviest first.
         parameters: parameters of the node.
         frame_prefix: prefix of the names of the links.
         starts: whether the body is new, or its lengths have changed since it was published.
-        describe: whether the URDF is due: the body is new, or the names of its frames are.
+        describe: whether to publish the URDF, because the body or the names of its frames are new.
         fixed: frame of mixtures, markers and the pose of the person; None: the frame of the camera.
     """
 
@@ -112,7 +112,7 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
     skeleton = body.skeleton
     joints = forward(tracker.estimate.body.skeleton, posterior.means).joints().transpose(2, 0, 1)
     ground = _ground_state(track)
-    # Both are made before anything is published: either may be invalid in a message.
+    # Both are made before anything is published, as either may turn out to be invalid.
     made = {
         'pose_mixture': lambda: _posterior(track, joints),
         'likelihood_mixture': lambda: _likelihood(track),
@@ -166,7 +166,7 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
 def nobody_messages(
     tracker: Tracker, waiting: WaitingImage, p: FilterParameters, wanted: Callable[[str], bool]
 ) -> Iterator[tuple[str, Any]]:
-    """Yields topics and messages of an image that ends a track: nobody is or was in view.
+    """Yields topics and messages of an image that ends a track, as nobody is or was in view.
 
     The overlay shows the image without modes and states the reason; all markers are removed.
     """
@@ -217,8 +217,8 @@ def robot_messages(
     """Yields the messages that robots act on.
 
     Args:
-        silence: time since the newest image was answered, s, if no other has come; None: it is
-            being answered.
+        silence: time since the outputs for the newest image were published, s; None: this call
+            publishes them.
     """
     if wanted('keep_out') or wanted('keep_out_markers'):
         content = robot.keep_out(parameters.keep_out_probability, silence)
@@ -233,7 +233,7 @@ def robot_messages(
 
 
 def _posterior(track: TrackedImage, joints: Array) -> PoseMixture:
-    """Return the posterior for a message, from joints (K, J, 3) in the camera frame."""
+    """Return the posterior for a message; `joints` (K, J, 3) are in the camera frame, m."""
     tracker, posterior = track.tracker, track.posterior
     velocities = tracker.estimate.velocities
     body, frame, positions = tracker.estimate.body, track.waiting.frame_id, joints
@@ -262,7 +262,7 @@ def _posterior(track: TrackedImage, joints: Array) -> PoseMixture:
 def _likelihood(track: TrackedImage) -> PoseMixture:
     """Return the undiscounted likelihood for a message, with its error model."""
     tracker, likelihood, frame = track.tracker, track.likelihood, track.waiting.frame_id
-    # The error of the focal length is the same in all images, like that of the shape.
+    # The error of the focal length is the same in all images, like the error of the shape.
     focal = depth_covariances(track.posterior.means[:1], track.parameters.focal_length_sigma)[0]
     body, found = tracker.estimate.body, tracker.estimate.likelihood
     shape = found.shape_covariance + focal

@@ -1,4 +1,4 @@
-"""Reports of changes of a track for the log, one for each change."""
+"""Log messages about changes of a track."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class TrackCondition(NamedTuple):
     Attributes:
         status: status of the tracker.
         doubted: whether the background was learned with the person in it, and the track needs
-            silhouettes: one that started from keypoints does not.
+            silhouettes (a track that started from keypoints does not).
         moved: whether the camera has moved since the background was taken.
         contradicted: whether the scene or the person contradicts the given gravity.
         track_id: number of the track.
@@ -70,20 +70,20 @@ def report_change(
     if now.doubted and not before.doubted:
         log.note(
             'background',
-            f'{IN_BACKGROUND}, as the image of {stamp_ns} ns shows: silhouettes are not used until '
-            'the scene has been seen where the person is now; give background_file, or begin with '
-            'the empty scene',
+            f'{IN_BACKGROUND}, as the image of {stamp_ns} ns shows: silhouettes are not used '
+            'until the scene behind the person has been seen; give background_file, or start '
+            'with the empty scene',
         )
     if now.moved and not before.moved:
-        remedy = 'call ~/reset; a camera that is to move needs fixed_frame or use_mask'
+        remedy = 'call ~/reset; a moving camera needs fixed_frame or use_mask'
         text = camera_moved_fault(tracker.silhouettes.watch.shift, stamp_ns, remedy)
         log.note('camera moved', text, warn=True)
     if now.contradicted and not before.contradicted:
         log.note(
             'direction of gravity',
-            f'the lines of the scene, or the person, contradict the gravity that is given, '
+            'the lines of the scene, or the person, contradict the given gravity, '
             f'{_numbers(-tracker.estimate.ground.up)}, at the image of {stamp_ns} ns; it is used '
-            'all the same: check that it is in the optical frame (x right, y down, z forward), or '
+            'anyway: check that it is in the optical frame (x right, y down, z forward), or '
             'gravity_frame and how the camera is mounted',
             warn=True,
         )
@@ -99,13 +99,13 @@ def report_change(
 
 
 def reversed_gravity(up: Array) -> str:
-    """Return the text of a warning that an accelerometer reading was given for gravity.
+    """Return the text of a warning that an accelerometer reading was given as gravity.
 
     Args:
         up: (3,) unit vector against gravity, camera frame.
     """
     return (
-        'the gravity that is given points to the head of the person, as an accelerometer at rest '
+        'the given gravity points to the head of the person, as an accelerometer at rest '
         f'measures it: the opposite is used, {_numbers(-up)}'
     )
 

@@ -1,4 +1,4 @@
-"""The start of a track: body, background, subject, mixture or box, read and checked at once."""
+"""Data that a track starts from: body, background, subject, mixture or box, read and checked."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from msg_tools.messages.pose_mixtures import pose_mixture_of
 
 @dataclass(frozen=True, eq=False)
 class TrackStart:
-    """Everything that a new tracker needs besides the camera.
+    """Everything that a new tracker needs in addition to the camera.
 
     Attributes:
         parameters: parameters of the track.
         body: body of the poses: the model, or the body of an initial mixture.
         background: (H, W, 3) BGR image of the empty scene; None: the background is learned.
         initial: prior of the first image; None: keypoints, a mask or a prediction start the track.
-        box: (left, top, right, bottom) that contains the person in the next image, px; it takes
-            precedence over `initial`. None: unknown.
+        box: (left, top, right, bottom) of a box around the person in the next image, px, which
+            takes precedence over `initial`; None: unknown.
     """
 
     parameters: FilterParameters
@@ -69,7 +69,8 @@ class TrackStart:
 
         Args:
             ground: gravity and floor, as far as they are known.
-            shared: background that several people share, learned elsewhere; None: its own.
+            shared: background that several trackers share and that is learned elsewhere; None:
+                the tracker learns its own.
 
         Raises:
             ValueError: the background was taken by another camera, or the box is not in the image.
@@ -111,12 +112,13 @@ def prepare_start(
     present: Body | None = None,
     region: Any = None,
 ) -> TrackStart:
-    """Reads the files that the parameters name.
+    """Return the data that a track starts from; reads the files that the parameters name.
 
     Args:
-        mixture: hmt_msgs/PoseMixture to start from; without components or None: the subject file.
+        mixture: hmt_msgs/PoseMixture to start from; if it is None or has no components, the track
+            starts from the subject file.
         present: body of the present track, if any; a mixture without segment lengths refers to it.
-        region: sensor_msgs/RegionOfInterest of the person; None, or of no width: unknown.
+        region: sensor_msgs/RegionOfInterest of the person; None or zero width: unknown.
 
     Raises:
         ValueError: a file or the mixture can not be used; one line with the reason.
@@ -130,7 +132,7 @@ def prepare_start(
         fixed = parameters.fixed_frame
         if fixed and content.frame_id in (fixed, f'{fixed}_optical'):
             raise ValueError(
-                f'the initial mixture is in the frame {content.frame_id}, which stands still: '
+                f'the initial mixture is in the frame {content.frame_id}, which does not move: '
                 'wanted that of the camera'
             )
         if present is not None and present.name == body.name:

@@ -36,45 +36,47 @@ class FilterParameters(CameraNodeParameters):
     """All parameters of the filter node.
 
     Attributes:
-        subject_file: YAML file with the joints of the person in one image, which starts the track;
-            if empty, other inputs or ~/reset start it.
-        background_file: Image of the empty scene; if empty, it is learned before the track starts,
-            once nothing has moved for two seconds.
-        body_model: Body model, 'human37', 'human34', 'human32' or a YAML file.
-        random_seed: Seed of all random numbers; the same images give the same results.
-        use_keypoints: If true, keypoints are a measurement and start a track without subject_file.
-        use_keypoints_3d: If true, positions of the same landmarks in space (topic keypoints_3d) are
-            weak evidence of depth.
-        use_depth: If true, depth images registered to the images (topic depth) are a measurement.
-        use_predictions: If true, predictions of bme_node start a track without subject_file and are
-            hypotheses.
-        gravity: Direction of gravity in the camera optical frame, three numbers of any length,
-            [0.0, 1.0, 0.0] for a level camera; if empty, lines of the scene show it where they can.
-        gravity_sigma: Standard deviation of the parameter gravity, degrees; lines of the scene
-            refine it within that.
+        subject_file: YAML file with the joints of the person in one image, from which the track
+            starts; if empty, other inputs or ~/reset start the track.
+        background_file: Image of the scene without people; if empty, the background is learned
+            before the track starts, once nothing has moved for two seconds.
+        body_model: Body model: 'human37', 'human34', 'human32' or a YAML file.
+        random_seed: Seed of all random numbers; the same images and seed give the same results.
+        use_keypoints: If true, 2D keypoints are a measurement and start a track if subject_file is
+            empty.
+        use_keypoints_3d: If true, 3D positions of the keypoints (topic keypoints_3d) are weak
+            evidence of depth.
+        use_depth: If true, depth images registered to the camera images (topic depth) are a
+            measurement.
+        use_predictions: If true, predictions of bme_node are pose hypotheses and start a track if
+            subject_file is empty.
+        gravity: Direction of gravity in the camera optical frame, three numbers of any scale, [0.0,
+            1.0, 0.0] for a level camera; if empty, it is estimated from straight lines in the scene
+            where possible.
+        gravity_sigma: Standard deviation of the parameter gravity, degrees; straight lines in the
+            scene refine gravity within it.
         camera_height: Height of the camera above the floor, m; 0 if unknown.
         focal_length_sigma: Relative standard deviation of the focal length in camera_info, which
-            makes the published depths uncertain; 0 for a calibrated camera, 0.2 for a guess.
-        gravity_frame: Frame with z up, such as odom or map; gravity from /tf then overrides the
-            parameter gravity at every image. Empty: off.
-        floor_in_gravity_frame: If true, the plane z = 0 of gravity_frame is the floor, and
-            overrides camera_height.
-        fixed_frame: Frame that stands still, such as odom; motion prior, gravity, floor and
-            contacts refer to it, and /tf gives the camera's motion. Empty: off.
+            makes published depths more uncertain; 0 for a calibrated camera, 0.2 for a guess.
+        gravity_frame: Frame whose z axis points up, such as odom or map; gravity from /tf then
+            overrides the parameter gravity in every image. If empty, /tf is not used for gravity.
+        floor_in_gravity_frame: If true, the plane z = 0 of gravity_frame is the floor and overrides
+            camera_height.
+        fixed_frame: World-fixed frame, such as odom, to which motion prior, gravity, floor and
+            contacts refer; /tf gives the camera's motion in it. If empty, they refer to the camera.
         publish_in_fixed_frame: If true, markers, person_pose and keep_out are in fixed_frame, whose
-            z axis must point up, and mixtures in <fixed_frame>_optical; if false, in the frame of
-            the camera.
-        publish_tf: If true, /tf has the links of the point estimate, and camera_upright where
+            z axis must point up, and mixtures in <fixed_frame>_optical; if false, all are in the
+            camera frame.
+        publish_tf: If true, /tf has the link frames of the point estimate, and camera_upright if
             gravity is known.
-        frame_prefix: Prefix of link names on /tf and in human_description; in a namespace its
+        frame_prefix: Prefix of link names on /tf and in human_description; in a namespace, the
             default is the namespace.
-        keep_out_probability: Probability with which keep_out holds the person, of each part of the
-            body and of the modes.
-        stale_time: Time without an answered image after which keep_out is STALE and grows, s.
-        forecast_rate: Number of poses per second on pose_forecast, at times after the images; 0
-            switches it off.
-        forecast_horizon: Maximum time from an image to a forecast, s; it should last until the next
-            image is answered.
+        keep_out_probability: Probability that keep_out contains each part of the body, and minimum
+            total weight of the modes that it covers.
+        stale_time: Time without an answered image after which keep_out becomes STALE and grows, s.
+        forecast_rate: Number of forecasts per second on pose_forecast; 0 switches them off.
+        forecast_horizon: Maximum time from an image to a forecast, s; it should exceed the time
+            until the next image is answered.
         tracker: settings of the tracker.
     """
 
@@ -156,15 +158,15 @@ class PeopleParameters(FilterParameters):
     """All parameters of the people node.
 
     Attributes:
-        source: Type of the messages on the topic detections, 'people' (hmt_msgs/People2D), 'yolo'
+        source: Type of the messages on the topic detections: 'people' (hmt_msgs/People2D), 'yolo'
             (yolo_msgs/DetectionArray), 'boxes' (vision_msgs/Detection2DArray) or 'floats'
             (std_msgs/Float32MultiArray).
-        max_people: Maximum number of people who are followed at the same time; of those who come
-            together the largest in the image are taken.
+        max_people: Maximum number of people who are tracked at the same time; if several appear at
+            once, the largest in the image are tracked.
         use_keypoints: If true, keypoints of the detections are a measurement and start tracks; if
-            false, only their boxes are used.
-        frame_prefix: Prefix of the names of all frames on /tf and in human_description, before
-            body_<id>/, which tells several robots apart.
+            false, only the boxes are used.
+        frame_prefix: Prefix of all frame names on /tf and in human_description, before body_<id>/;
+            it distinguishes several robots.
     """
 
     source: str = parameter_field('people', NEXT_CONFIGURE)

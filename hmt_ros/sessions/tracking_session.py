@@ -1,6 +1,6 @@
-"""Session of the filter: tracks one person before a camera; `PeopleSession` tracks several.
+"""Session of the filter, which tracks one person; `PeopleSession` tracks several people.
 
-The rules, besides those of `CameraSession`:
+The rules, in addition to those of `CameraSession`:
 
 - An image waits for the inputs that are used (`image_inputs`); keypoints without names, and
   mixtures without components, mean that nobody was seen.
@@ -80,7 +80,7 @@ class TrackingState(CameraState):
         return f'{self.modes} modes'
 
     def trouble(self) -> str:
-        """Return whether the track is lost, nobody is in view or the background is unusable."""
+        """Return the problem: lost track, nobody in view, or unusable background; '' if none."""
         if self.status == Status.NOBODY.value:
             return 'nobody in view'
         if self.status == Status.LOST.value:
@@ -105,10 +105,10 @@ class TrackingState(CameraState):
 
 
 class TrackingSession(CameraSession[FilterParameters, Any]):
-    """Tracks the people before one camera; see `Session` for arguments and attributes.
+    """Tracks people in the images of a camera; see `Session` for arguments and attributes.
 
     Attributes:
-        start: start of the tracks.
+        start: data that new tracks start from.
         tracks: tracks of the people; always one in this class.
     """
 
@@ -140,21 +140,21 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
 
     @property
     def answered(self) -> int:
-        """Number of images that were answered for robots."""
+        """Number of images for which outputs for robots were published."""
         return self._shared.answered
 
     def restart(self, start: TrackStart | None = None) -> None:
         """Drops the tracks; new ones start with the images that follow.
 
         Args:
-            start: start of the new tracks; None: from the parameters or, if these name a file that
-                can not be used, the previous start.
+            start: data that the new tracks start from; None: data that the parameters name or, if
+                a file can not be used, the previous data.
         """
         if start is None:
             try:
                 start = prepare_start(self.parameters)
             except ValueError as error:
-                text = f'{public_line(error)}; {self.ESTIMATE} starts as the time before'
+                text = f'{public_line(error)}; {self.ESTIMATE} starts as it did the last time'
                 self._log.fault('start', text)
                 start = self.start
         self.start = start
@@ -163,11 +163,12 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
         super().restart()
 
     def stale(self, silence: float, answered: int) -> list[Output]:
-        """Return messages for robots while no image is answered; may be called by any thread.
+        """Return messages that tell robots that the estimate is old. Thread-safe.
 
         Args:
-            silence: time since the newest image was answered, s.
-            answered: value of the attribute at that time; if it has risen, there are no messages.
+            silence: time since the outputs for the newest image were published, s.
+            answered: value of the attribute `answered` then; if it has changed since, no messages
+                are returned.
         """
         with self._shared.answering:
             if answered != self.answered:
@@ -175,7 +176,7 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
             return [made for track in self.tracks for made in track.stale(silence)]
 
     def forecast(self, stamp_ns: int) -> Any:
-        """Return hmt_msgs/PoseMixture at a time, see `RobotOutputs`; callable from any thread."""
+        """Return the hmt_msgs/PoseMixture of a forecast, see `RobotOutputs`. Thread-safe."""
         return pose_mixture_message(self._messages, self.tracks[0].robot.forecast(stamp_ns))
 
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
@@ -186,7 +187,7 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
             self._log.prefix = f'{track.person}: ' if track.person else ''
             outcomes.add(track.follow(waiting, camera, seen, self.parameters))
             self._log.prefix = ''
-        # The counts are of images, not of people.
+        # Images are counted, not people.
         if True in outcomes:
             self._log.counts['tracked'] += 1
         elif False in outcomes:
@@ -194,14 +195,14 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
 
     def _jump_back(self, first: int, last: int) -> None:
         super()._jump_back(first, last)
-        # The numbers of the tracks restart with time.
+        # After a jump back, track numbers start from 1 again.
         self._keypoints.chosen.forget()
         self._begin()
 
     # Methods for one person; `PeopleSession` overrides them.
 
     def _begin(self) -> None:
-        """Sets the state in which nothing has been tracked."""
+        """Resets the tracks to the state before the first image."""
         self.tracks = (Track('', self.parameters, self.start, self._shared),)
 
     @classmethod
@@ -226,7 +227,7 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
             ValueError: the message can not be used; one line.
         """
         if len(message.components) == 0:
-            # A predictor that leaves an image to the track does not know whether nobody is there.
+            # A predictor that leaves an image to the track does not know whether anybody is there.
             left = message.state == TrackState.TRACKING or getattr(message, 'reason', '')
             return None if left else Status.NOBODY
         try:
@@ -236,7 +237,7 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
             raise ValueError(f'pose_prediction: {error}') from error
 
     def _people_in(self, waiting: WaitingImage, camera: Camera) -> Iterator[tuple[Track, Seen]]:
-        """Yields each track with its evidence; the track is updated before the next is yielded."""
+        """Yields each track with its evidence; the caller updates it before the next is yielded."""
         keypoints = self._keypoints.at_joints(
             waiting.content(KEYPOINTS),
             waiting.content(KEYPOINTS_3D),

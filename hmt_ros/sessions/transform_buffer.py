@@ -2,7 +2,7 @@
 
 The rules are those of tf2: a frame has one parent; between two stamps rotations are interpolated on
 the shortest arc and positions along a line; nothing is extrapolated; a transform on /tf_static
-holds at all times. The same messages in the same order give the same transforms.
+is valid at all times. The same messages in the same order give the same transforms.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from msg_tools.messages.headers import SECOND_NS, time_ns
 TF, TF_STATIC = TRANSFORMS = ('tf', 'tf_static')
 TRANSFORMS_TYPE = 'tf2_msgs/msg/TFMessage'
 
-# Time that moving frames are remembered, as in tf2, s; maximum numbers of frames and of stamps.
+# Time for which places of moving frames are kept, as in tf2, s; maximum numbers of frames, and of
+# stamps per frame.
 REMEMBERED = 10.0
 MOST_FRAMES, MOST_STAMPS = 1000, 10_000
 # Maximum deviation of the length of a quaternion from 1, twice that of tf2.
@@ -75,17 +76,17 @@ class _Sample(NamedTuple):
 
 
 class _Frame:
-    """Places of a frame over time.
+    """Places of a frame in its parent over time.
 
     Attributes:
-        static: place at all times; None if the frame moves.
+        static: constant place; None if the frame moves.
         places: stamps, ns, and places of a moving frame, in the order of the stamps.
     """
 
     def __init__(self, static: _Sample | None = None) -> None:
         self.static = static
         self.places: list[tuple[int, _Sample]] = []
-        # A place at a distant time, until the next one confirms that time or not.
+        # A place at a distant time, which is used only if the next place confirms that time.
         self._aside: tuple[int, _Sample] | None = None
 
     @property
@@ -107,7 +108,7 @@ class _Frame:
         del self.places[: max(old, len(self.places) - MOST_STAMPS)]
 
     def at(self, stamp: int) -> _Sample | None:
-        """Return the place at a time; None if the time is outside of the known ones."""
+        """Return the place at a time; None outside of the range of known stamps."""
         if self.static is not None:
             return self.static
         after = self.first(stamp)
@@ -141,7 +142,7 @@ class TransformBuffer:
 
         Args:
             message: message of `rosbags` or of ROS.
-            static: whether it is from /tf_static.
+            static: whether the message is from /tf_static.
 
         Returns:
             A line for each transform that was rejected, with the reason.
@@ -156,15 +157,15 @@ class TransformBuffer:
         return faults
 
     def forget_after(self, stamp_ns: int) -> None:
-        """Removes the places of moving frames after a time to which the clock has jumped back."""
+        """Removes the places of moving frames that are later than a stamp."""
         for frame in self._frames.values():
             del frame.places[frame.first(stamp_ns + 1) :]
         self._frames = {name: x for name, x in self._frames.items() if x.static or x.places}
 
     def has_later(self, stamp_ns: int, timeout_ns: float) -> bool:
-        """Whether any moving frame has a place that is later by more than a timeout.
+        """Whether any moving frame has a place that is later than a stamp by more than a timeout.
 
-        A place that is much later is no evidence on other frames.
+        A much later place does not count, because its stamp may be wrong.
         """
         longest = timeout_ns + REMEMBERED * SECOND_NS
         return any(
@@ -224,7 +225,7 @@ class TransformBuffer:
         known.put(time_ns(stamped.header.stamp), sample)
 
     def _to_root(self, frame: str, stamp_ns: int) -> tuple[dict[str, Transform], str]:
-        """Return the transforms from a frame to its ancestors, and why they end; '' at the root."""
+        """Return the transforms to all ancestors of a frame; why the root is not reached, or ''."""
         reached = {frame: Transform(np.eye(3), np.zeros(3))}
         here, total = frame, reached[frame]
         while (known := self._frames.get(here)) is not None:

@@ -1,4 +1,4 @@
-"""Mixtures over whole trajectories: motions along a filter's chain, and VMS on mixtures alone."""
+"""Mixtures over trajectories: motions along a filter's chain, and VMS on independent mixtures."""
 
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mode_chain import Link, backward_weights, drawn_paths

@@ -3,11 +3,11 @@
     node  p(r_t | m_i)  = int p(r_t | x) m_i(x) dx           = sum_j w_j N(mu_i; mu_j, S_i + S_j)
     link  p(m_j | m_i)  = int int m_j(y) p(y | x) m_i(x)     = N(mu_j; A mu_i, S_j + A S_i A' + Q)
 
-in closed form. Where the state has velocities, the link integrates over the distribution of an
-unknown velocity.
+in closed form. If the state has velocities, the link integrates over the distribution of an unknown
+velocity.
 
-Paths are those of exact max-product over the layers, for all sources at once. The values of nodes
-and links are densities and may exceed 1; dynamic programming over layers needs no bound on them.
+Paths are found by exact max-product over the layers, for all first nodes at once. The values of
+nodes and links are densities and can exceed 1; dynamic programming does not need bounded values.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class EmbeddedNetwork:
 
     @property
     def times(self) -> int:
-        """T."""
+        """Number T of times."""
         return len(self.nodes)
 
 
@@ -54,7 +54,7 @@ def embedded_network(
     """The network of Gaussian modes, in closed form.
 
     Args:
-        intervals: (T-1,) s.
+        intervals: (T-1,) between successive times, s.
     """
     d, n = dynamics.dimension, dynamics.state_dimension
     begin = np.concatenate([[0], np.cumsum([len(mixture) for mixture in mixtures])])
@@ -76,7 +76,7 @@ def embedded_network(
         predicted[at] = product(means[at], own.T)
         spread[at] = product(product(own, covariances[at]), own.T) + noise
 
-    # All pairs in one go: the modes of a time with each other, and with those of the next time.
+    # All pairs at once: modes of the same time, and modes of successive times.
     within = [_pairs_within(len(mixture)) for mixture in mixtures]
     node_pairs = np.concatenate([begin[t] + pairs for t, pairs in enumerate(within)], axis=1).T
     across = [_pairs_across(len(a), len(b)) for a, b in pairwise(mixtures)]
@@ -102,7 +102,7 @@ def embedded_network(
 
 
 def _node_values(weights: Array, densities: Array, pairs: Index) -> Array:
-    """log (K,) of the sums over modes of weights times densities, given for pairs (2, P)."""
+    """Logs (K,) of densities summed over weighted modes, from log densities of pairs (2, P)."""
     row, column = pairs
     log = np.empty((len(weights), len(weights)))
     log[row, column] = log[column, row] = densities
@@ -147,9 +147,9 @@ class Paths:
 
 
 def k_best_paths(network: EmbeddedNetwork, k: int) -> Paths:
-    """The k best paths from every first to every last node, the best of all first.
+    """The k best paths from every first to every last node, sorted from the best on.
 
-    O(K^3 k T log k); there are fewer where fewer exist.
+    The cost is O(K^3 k T log k). A pair of nodes with fewer than k paths gets all of them.
 
     Raises:
         ValueError: k < 1.
@@ -157,7 +157,7 @@ def k_best_paths(network: EmbeddedNetwork, k: int) -> Paths:
     if k < 1:
         raise ValueError(f'k must be at least 1, saw {k}')
     sources = len(network.nodes[0])
-    # best (sources, nodes, rank); a path that does not exist has value -inf.
+    # best has shape (sources, nodes, ranks); a missing path has value -inf.
     best = np.where(np.eye(sources, dtype=bool), network.nodes[0][:, None], -np.inf)[:, :, None]
     # Predecessor of each kept path, and number of kept paths per source and node.
     back: list[tuple[Index, int]] = []
@@ -186,11 +186,11 @@ def k_best_paths(network: EmbeddedNetwork, k: int) -> Paths:
 
 
 def diverse_subset(paths: Paths, count: int, penalty: float = 2.0) -> Paths:
-    """Paths that are probable and differ from each other, in the order of choice.
+    """Probable paths that differ from each other, in the order of choice.
 
-    Greedily the path with the greatest log value less a penalty, for every time, on the share of
-    paths already chosen that visit the same node there [after Batra et al., Diverse M-Best, ECCV
-    2012]. With no penalty these are the best paths.
+    Each choice maximises the log value minus a penalty, which at every time is proportional to the
+    share of chosen paths that visit the same node [after Batra et al., Diverse M-Best, ECCV 2012].
+    Without a penalty the best paths result.
 
     Raises:
         ValueError: count < 1.

@@ -3,11 +3,12 @@
     E(X) = -log p(x_1) - sum_t log p(x_t | x_(t-1)) - sum_t log p(r_t | x_t)                    (1)
     F(q) = E_q[log q(X) - log p(X, R)],    q = sum_i a_i N(M_i, s_i^2 S_i)                      (2)
 
-The distinct motions of a window start descents on (1) within limits. All use one prior: that of the
-motion with the largest noise factor, with the feet fixed that rest in the heaviest motion. Of
-optima that are one motion the most probable is kept; (2) is over these. Its adapted variables were
-chosen on clips (docs/smoothing.md): the chain of the filter's modes weighs motions better than (2),
-so an optimum gets the total weight of the motions that converged to it.
+(1) is minimised within limits, from each distinct motion of a window. All motions use one prior: it
+has the largest of their noise factors, and fixes the feet that rest in the heaviest motion. If
+several optima are one motion, the most probable one is kept; (2) is over the kept optima. The
+adapted variables of (2) were chosen on clips (docs/smoothing.md). The chain of the filter's modes
+weighs motions better than (2), so an optimum gets the total weight of the motions that converged to
+it.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import refine
 from hmt_ros.smoothing.variational_mixture import minimise_free_energy
 
-# Maximum number of refined motions, and minimum weight of one.
+# Maximum number of refined motions, and minimum weight of a refined motion.
 MOST, LEAST = 4, 0.01
 # Maximum number of steps of a descent, and gain of a step below which it ends, nats.
 STEPS, TOLERANCE = 30, 0.01
@@ -51,7 +52,7 @@ def refined_on_images(
         adapt: variables of the free energy, some of 'weights' and 'inflation'.
 
     Returns:
-        The distinct optima, and the other motions unchanged; with the free energy of the optima.
+        The distinct optima with their free energy, and the other motions, unchanged.
 
     Raises:
         ValueError: the number of images is wrong.
@@ -80,7 +81,7 @@ def refined_on_images(
     origin = chosen[optima.starts]
     kept, labels = _first_of_each(smoother, motions, optima.states, motions.weights[origin], 0.0)
     optima, others = optima[kept], np.setdiff1d(np.arange(len(motions)), chosen)
-    # Component of the result of each motion.
+    # Matrix that maps each motion to its component of the result.
     count = len(kept)
     into = np.zeros((len(motions), count + len(others)))
     into[origin, labels] = 1.0
@@ -132,7 +133,7 @@ def _first_of_each(
     weights: Array,
     least: float,
 ) -> tuple[Index, Index]:
-    """Return the first of states (N, T, n) of each motion, and the motion (N,) of each."""
+    """Group states (N, T, n) into motions; return the first index of each, and labels (N,)."""
     assert motions.stamps_ns is not None
     points = smoother.points_of(states[:, :, : motions.dimension]).swapaxes(0, 1)
     nodes = np.broadcast_to(np.arange(len(states))[:, None], states.shape[:2])

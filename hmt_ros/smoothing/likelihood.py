@@ -1,7 +1,7 @@
 """Likelihoods of observations for a smoother: -log p(r_t | x_t), its gradient and its curvature.
 
-They are the mixtures of a filter, `MixtureLikelihood`, or any other `EnergyTerm` whose rows are
-times, such as the images themselves (VMS 5).
+A likelihood is made of the mixtures of a filter (`MixtureLikelihood`), or is another `EnergyTerm`
+whose rows are times, such as the likelihood of the images themselves (VMS 5).
 """
 
 from __future__ import annotations
@@ -21,29 +21,30 @@ from hmt_ros.inference.linear_algebra import inverse_triangular, log_sum_exp, pr
 
 
 class SequenceLikelihood(EnergyTerm, Protocol):
-    """-log p(r_t | x_t) of all times t < T of a sequence; the rows of the term are times."""
+    """Energies -log p(r_t | x_t) at the times t < T of a sequence; the rows are times."""
 
     @property
     def times(self) -> int:
-        """T."""
+        """Number T of times."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class MixtureLikelihood:
-    """p(r_t | x_t) = sum_k w_k N(x_t; m_k, S_k), the mixtures of a filter.
+    """Likelihood p(r_t | x_t) = sum_k w_k N(x_t; m_k, S_k) from the mixtures of a filter.
 
     With y_k = W_k (x - m_k), S_k^-1 = W_k' W_k, responsibilities r_k and u_k = W_k' y_k, the
     gradient of -log p is u = sum_k r_k u_k and its Hessian sum_k r_k S_k^-1 - (sum_k r_k u_k u_k' -
-    u u'). Without the part in brackets it belongs to the quadratic that expectation-maximisation
-    minimises, which lies above -log p: a full step never ascends.
+    u u'). Without the part in brackets, this is the Hessian of the quadratic that
+    expectation-maximisation minimises. The quadratic lies above -log p, so a full step never
+    ascends.
 
     Attributes:
-        first: (T+1,) the modes of time t are first[t] .. first[t+1] - 1.
+        first: (T+1,) index of the first mode of each time; time t has first[t] .. first[t+1] - 1.
         log_scales: (K,) log w_k - log |2 pi S_k| / 2.
-        means: (K, d).
+        means: (K, d) m_k.
         whiteners: (K, d, d) W_k, lower triangular.
-        precisions: (K, d, d).
+        precisions: (K, d, d) S_k^-1.
     """
 
     first: NDArray[np.int64]
@@ -57,8 +58,8 @@ class MixtureLikelihood:
         """The likelihood of a sequence of mixtures; modes without weight are left out.
 
         Raises:
-            ValueError: a mixture without modes or weight, of another dimension, or with a
-                covariance that is not positive definite.
+            ValueError: a mixture has no modes or weight, another dimension, or a covariance that is
+                not positive definite.
         """
         check_mixtures(mixtures)
         kept = [mixture[mixture.weights > 0] for mixture in mixtures]
@@ -78,11 +79,11 @@ class MixtureLikelihood:
 
     @property
     def times(self) -> int:
-        """T."""
+        """Number T of times."""
         return len(self.first) - 1
 
     def modes_of(self, path: Index) -> tuple[Array, Array, Array]:
-        """log scales (T,), means (T, d) and precisions (T, d, d) of the modes along a path (T,)."""
+        """Log scales (T,), means (T, d) and precisions (T, d, d) of the modes on a path (T,)."""
         at = self.first[:-1] + path
         return self.log_scales[at], self.means[at], self.precisions[at]
 
@@ -128,25 +129,25 @@ class LikelihoodPart:
     def energy(
         self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
     ) -> Energy:
-        """See `EnergyTerm`; the rows are times from the first on."""
+        """See `EnergyTerm`; the rows are times relative to the first."""
         return self.whole.energy(x, rows + self.first, derivatives=derivatives)
 
 
 def counted(mixture: GaussianMixture, share: float) -> GaussianMixture:
-    """Discount the likelihood of an observation of which only a share a is new information.
+    """Discount the likelihood of an observation that has only a share a of new information.
 
         sum_k v_k N(m_k, S_k / a) / sum_k v_k,        v_k = w_k^a |S_k|^((1 - a) / 2)
 
-    Where errors last, each observation repeats a part of the information of those before, and
-    counts with the share a (`inference.error_model`): near each mode the density is the power a of
-    w_k N(m_k, S_k).
+    If errors persist, each observation repeats a part of the information of earlier ones, and is
+    used with the share a (`inference.error_model`). The density near each mode is then w_k N(m_k,
+    S_k) to the power a.
 
     Args:
-        mixture: the whole evidence; modes without weight are left out.
-        share: a.
+        mixture: likelihood without discount; modes without weight are left out.
+        share: share a of new information.
 
     Raises:
-        ValueError: a share that is not in (0, 1].
+        ValueError: the share is not in (0, 1].
     """
     if not 0.0 < share <= 1.0:
         raise ValueError(f'the share of the evidence must lie in (0, 1], saw {share}')
@@ -160,7 +161,7 @@ def check_mixtures(mixtures: Sequence[GaussianMixture]) -> None:
     """Checks that the mixtures of a window, one for each time, can be smoothed.
 
     Raises:
-        ValueError: a mixture can not be smoothed; the message has its index.
+        ValueError: a mixture can not be smoothed; the message gives its index.
     """
     if len(mixtures) == 0:
         raise ValueError('no mixtures to smooth; wanted one for each time')

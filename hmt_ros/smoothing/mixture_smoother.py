@@ -1,4 +1,4 @@
-"""Variational mixture smoothing: from mixtures per time to one over trajectories (VMS fig. 1)."""
+"""Variational mixture smoothing: a mixture over trajectories from one per time (VMS fig. 1)."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ from hmt_ros.smoothing.variational_mixture import (
     minimise_free_energy,
 )
 
-# Maximum number of noise values in the descent of the free energy; limits the number of samples.
+# Maximum number of noise values in the descent of the free energy, which limits the samples.
 SAMPLE_BUDGET = 400_000
 # Minimum weight of a component in the descent, relative to the heaviest one.
 LEAST_SHARE = 1e-6
-# Number of images from which paths are first refined where they differ from the best one; margin of
-# such a part on either side, images.
+# Minimum number of images for which the parts of paths that differ from the best path are refined
+# first, and margin of such a part on either side, images.
 LONG = 100
 MARGIN = 8
 # Distance from an optimum below which the Gaussian of a path is redundant, standard deviations.
 SAME_DISTANCE = 0.3
-# Distances below which modes are merged, as alternatives to the optima, standard deviations.
+# Distances below which modes are merged to get alternatives to the optima, standard deviations.
 MERGE_DISTANCES = (1.75, 2.5)
 
 
 @dataclass(frozen=True, eq=False)
 class MixtureSmoother:
-    """Smooths sequences of mixtures whose errors are independent; else see `likelihood.counted`.
+    """Smooths sequences of mixtures with independent errors; otherwise see `likelihood.counted`.
 
     Attributes:
         dynamics: dynamics of the state.
-        lower, upper: (d,) limits of the pose at every time; None: none.
+        lower, upper: (d,) limits of the pose at every time; None: no limits.
         max_trajectories: maximum number of components of the result.
         adapt: variables of the descent of the free energy, some of `ADAPTABLE`; empty: no descent.
         max_iterations: maximum number of iterations of the descent of the free energy.
@@ -83,9 +83,9 @@ class MixtureSmoother:
         Args:
             mixtures: T likelihoods over the pose, whose weights need not sum to 1.
             stamps_ns: (T,) times, increasing; None: one `dynamics.step` apart.
-            observation: likelihood for refinement and free energy, for example of the images
-                themselves; the mixtures then only give the initial paths. None: the likelihood of
-                the mixtures.
+            observation: likelihood for refinement and free energy, for example from the images
+                themselves; the mixtures then give only the initial paths. None: the mixtures are
+                the likelihood.
 
         Raises:
             ValueError: mixtures or stamps can not be smoothed; the message says why.
@@ -110,7 +110,7 @@ class MixtureSmoother:
         stamps_ns: Sequence[int] | None = None,
         observation: SequenceLikelihood | None = None,
     ) -> TrajectoryMixture:
-        """Smooth checked inputs; see `smooth`."""
+        """Smooth inputs that have been checked; see `smooth`."""
         likelihood = sequence.likelihood if observation is None else observation
         best, least = self.optima(sequence, likelihood), np.nan
         for other in self.merged_paths(sequence) if observation is None else ():
@@ -131,7 +131,7 @@ class MixtureSmoother:
         prior, paths = sequence.prior, self.paths(sequence)
         d = prior.dimension
         starts = sequence.states(paths)
-        # Parts that the others share with the best path are refined once.
+        # Parts that other paths share with the best path are refined once.
         best = refine(starts[:1], prior, likelihood, low[:d], high[:d])
         shared = paths.nodes == paths.nodes[0]
         starts = np.where(shared[:, :, None], best.states, starts)
@@ -144,7 +144,7 @@ class MixtureSmoother:
         room = self.max_trajectories - len(refined)
         if room == 0 or len(refined) == len(paths) or likelihood is not sequence.likelihood:
             return result
-        # Modes that overlap share an optimum, which one Gaussian describes badly.
+        # Overlapping modes share an optimum, which one Gaussian describes badly.
         beside = path_gaussians(paths.nodes, prior, sequence.likelihood)
         distinct = [
             i
@@ -161,7 +161,7 @@ class MixtureSmoother:
         )
 
     def merged_paths(self, sequence: ModeSequence) -> Iterator[TrajectoryGaussians]:
-        """Yield Gaussians of paths through merged modes, for each distance that merges any."""
+        """Yield Gaussians of paths through merged modes, for each distance that merges modes."""
         count = sum(len(mixture) for mixture in sequence.mixtures)
         for distance in MERGE_DISTANCES:
             merged = sequence.merged(distance)
@@ -189,7 +189,7 @@ class MixtureSmoother:
         seed: int,
         max_iterations: int,
     ) -> VariationalMixture:
-        """Optimise the heavy components; the others are unchanged."""
+        """Optimise the heavy components, and leave the others unchanged."""
         low, high = self._limits()
         weights, means = candidates.weights, candidates.states.copy()
         heavy = weights > LEAST_SHARE * weights.max()
@@ -296,8 +296,8 @@ def with_refined_parts(
 ) -> Array:
     """Optimise the parts of initial trajectories (M, T, n) that differ from the first one.
 
-    The paths of a long sequence agree except at its ends, and many share the same ends. Their parts
-    are few and short, while each step of a whole trajectory costs as much as all its images.
+    The paths of a long sequence agree except near its ends, and many share the same ends. The
+    differing parts are few and short, while a step of a whole trajectory evaluates all images.
 
     Args:
         starts: (M, T, n) initial trajectories; the first one is an optimum.
@@ -328,7 +328,7 @@ def with_refined_parts(
 
 
 def intervals_of(stamps_ns: Sequence[int] | None, times: int, step: float) -> Array:
-    """Return the intervals (T-1,), s.
+    """Return the intervals (T-1,) between successive times, s.
 
     Raises:
         ValueError: the number of stamps is wrong, or a stamp does not increase.

@@ -1,18 +1,18 @@
 """The modes of a sequence of mixtures under a dynamical model, and the Gaussians of their paths.
 
 Overlapping modes are one explanation of the observation rather than two. If they are merged into
-one Gaussian with their mean and covariance, a path represents all paths through the merged modes,
+one Gaussian of the same mean and covariance, a path represents all paths through the merged modes,
 and fewer trajectories cover the same posterior (VMS 4).
 
-Where the likelihood is a mixture at every time, the posterior is a mixture too, with a component
-for every path k = (k_1 .. k_T):
+If the likelihood is a mixture at every time, the posterior is a mixture too, with a component for
+every path k = (k_1 .. k_T):
 
     w_k N(X; M_k, P_k^-1),     P_k = P + diag(S_{k_t}^-1),     P_k M_k = h + (S_{k_t}^-1 m_{k_t})
 
     log w_k = sum_t log (w_{k_t} N(0; m_{k_t}, S_{k_t})) + (M_k' P_k M_k - log |P_k / 2 pi|) / 2 - c
 
-with P, h and c those of the prior. Overlapping modes have fewer optima than paths; if there are few
-optima, these Gaussians complement them.
+with P, h and c from the prior. If modes overlap, there are fewer optima than paths; these Gaussians
+then complement the optima.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from hmt_ros.smoothing.embedded_network import (
 )
 from hmt_ros.smoothing.likelihood import MixtureLikelihood
 
-# Number of candidates per selected path.
+# Number of candidate paths per selected path.
 CANDIDATES = 4
 
 
@@ -50,9 +50,9 @@ class ModeSequence:
     """Mixtures at T times.
 
     Attributes:
-        mixtures: over the d variables of the pose, T of them.
+        mixtures: T mixtures over the d variables of the pose.
         dynamics: dynamics of the state of n variables.
-        intervals: (T-1,) s.
+        intervals: (T-1,) between successive times, s.
     """
 
     mixtures: tuple[GaussianMixture, ...]
@@ -61,7 +61,7 @@ class ModeSequence:
 
     @cached_property
     def likelihood(self) -> MixtureLikelihood:
-        """-log of the mixtures."""
+        """The mixtures as a likelihood."""
         return MixtureLikelihood.of(self.mixtures)
 
     @cached_property
@@ -77,7 +77,8 @@ class ModeSequence:
     def paths(self, count: int) -> Paths:
         """Return at most `count` probable paths that differ from each other.
 
-        The best of each pair of ends; where that makes less, further ones of the same pairs.
+        Candidates are the best path for each pair of ends, and further paths for the same pairs if
+        these are too few.
         """
         pairs = len(self.network.nodes[0]) * len(self.network.nodes[-1])
         per_pair = 1 if pairs >= count else -(-CANDIDATES * count // pairs)
@@ -102,12 +103,12 @@ class ModeSequence:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryGaussians:
-    """Components of the posterior: of paths, or around optima.
+    """Gaussian components of the posterior, from paths or around optima.
 
     Attributes:
         states: (P, T, n) means.
         factors: P Cholesky factors of the precisions.
-        log_weights: (P,) log of their mass in p(X, R).
+        log_weights: (P,) log of each component's mass in p(X, R).
     """
 
     states: Array
@@ -123,7 +124,7 @@ class TrajectoryGaussians:
 def path_gaussians(
     nodes: Index, prior: TrajectoryPrior, likelihood: MixtureLikelihood
 ) -> TrajectoryGaussians:
-    """The components of paths (P, T), indices of modes with weight."""
+    """The posterior components of paths, given as indices (P, T) of modes with weight."""
     count, times = nodes.shape
     n, d = prior.information.shape[1], prior.dimension
     states, log_weights, factors = np.empty((count, times, n)), np.empty(count), []

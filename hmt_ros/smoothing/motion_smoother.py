@@ -4,11 +4,11 @@
            + sum_t |x_t - z_t|^2_(R_t) / 2
 
 z_t and R_t are the mean and covariance of the motion's modes in an image (`motions`), N(m_1, P_1)
-is the state that the motion's past predicts. l_t scales the noise of the motion prior: it is the
-least of 1, 4, 16, 64 with which the states stay close to the motion's modes. An image whose modes
-are far from the states is taken for wrong and gets a low weight. A motion whose past is far from
-all its modes starts without this past. E is quadratic with a block-tridiagonal Hessian; states
-beyond limits are clipped to them.
+is the prediction of the first state from the motion's past. l_t scales the noise of the motion
+prior; it is the smallest of 1, 4, 16, 64 that keeps the states close to the motion's modes. An
+image whose modes are far from the states is an outlier and gets a low weight. A past that is far
+from all modes of its motion is ignored. E is quadratic with a block-tridiagonal Hessian; states are
+clipped to the limits.
 """
 
 from __future__ import annotations
@@ -50,11 +50,12 @@ from hmt_ros.smoothing.trajectory_refinement import limits_of_states
 PATHS = 96
 # Values of l, and the median distance from the modes above which the next value is tried, m.
 LIVELIER, ASTRAY = (1.0, 4.0, 16.0, 64.0), 0.05
-# Distance above which the modes of an image are taken for wrong, m, and number of such passes.
+# Distance of an image's modes from the states above which the image is an outlier, m, and maximum
+# number of passes that reduce the weights of outliers.
 WRONG, WRONG_PASSES = 0.15, 3
 # Distance from all motions above which a mode is a stray, m.
 STRAY = 0.05
-# Minimum weight of a motion of several images, and of one whose resting points are fixed.
+# Minimum weight of a motion over several images, and of a motion whose resting points are fixed.
 LEAST, LEAST_HELD = 0.03, 0.1
 
 
@@ -64,8 +65,8 @@ class ImageModes(NamedTuple):
     Attributes:
         stamp_ns: stamp of the image, ns.
         link: posterior weights and ancestry of its K modes.
-        mixture: the likelihood of the image, undiscounted; K components. Its weights are not used.
-        errors: model of errors that last from image to image.
+        mixture: the undiscounted likelihood of the image, K components; weights are not used.
+        errors: model of errors that persist from image to image.
     """
 
     stamp_ns: int
@@ -79,9 +80,9 @@ class WindowImage(NamedTuple):
 
     Attributes:
         modes: the modes of the image.
-        counted: the likelihood with covariances for changes between images.
+        counted: the likelihood, with covariances that account for persistent errors.
         points: (K, P, 3) points of the modes, m.
-        lasting: factor on the posterior variance, because the image's errors last.
+        lasting: factor on the posterior variance, because the image's errors persist.
         alone: factor on the covariances of modes that belong to no motion.
     """
 
@@ -96,8 +97,8 @@ class FirstStates(NamedTuple):
     """Gaussian prediction of the first states of M motions of a window.
 
     Attributes:
-        means, covariances: (M, n) and (M, n, n) of the states.
-        liveliness: (M,) l of the motion that each continues.
+        means, covariances: (M, n) and (M, n, n) moments of the states.
+        liveliness: (M,) noise factor l of each motion's predecessor.
     """
 
     means: Array
@@ -106,7 +107,7 @@ class FirstStates(NamedTuple):
 
 
 class Past(NamedTuple):
-    """Prediction of the first image of a window from the images before.
+    """Prediction for the first image of a window, from earlier images.
 
     Attributes:
         shares: (K, M) probability that each mode of the image continues each of M motions.
@@ -120,13 +121,13 @@ class Past(NamedTuple):
 
 
 class ChainPrior(NamedTuple):
-    """Prior of the states, for the core.
+    """Prior of the states, as input of the compiled core.
 
     Attributes:
         before, after, forth, which: fields of `Couplings`.
         shares: (T-1,) 1 / l.
-        known: (n, n) P_1.
-        pull: (n,) P_1 m_1.
+        known: (n, n) P_1^-1.
+        pull: (n,) P_1^-1 m_1.
     """
 
     before: Array
@@ -142,12 +143,12 @@ class MotionStates(NamedTuple):
     """The states of a motion.
 
     Attributes:
-        states: (T, n).
-        factor: factor of their precision.
-        log_joint: log p(X, R), with Gaussian images.
-        liveliness: l.
+        states: (T, n) smoothed states.
+        factor: Cholesky factor of the precision of the states.
+        log_joint: log p(X, R), with Gaussian image likelihoods.
+        liveliness: noise factor l.
         trust: (T,) factor on the precision of each image.
-        fresh: whether the motion begins without the past.
+        fresh: whether the motion ignores the past.
     """
 
     states: Array
@@ -164,9 +165,9 @@ class SmoothedMotions(NamedTuple):
     Attributes:
         trajectories: the M trajectories.
         shares: T arrays (K_t, M), probabilities that each mode belongs to each motion.
-        evidence: evidence of the images; wrong images have larger covariances.
-        liveliness: (M,) l.
-        fresh: (M,) whether a motion begins without the past.
+        evidence: evidence of the images; outlier images have larger covariances.
+        liveliness: (M,) noise factor l.
+        fresh: (M,) whether a motion ignores the past.
         first: prediction from the past; None: no past.
     """
 
@@ -184,9 +185,9 @@ class MotionSmoother:
 
     Attributes:
         dynamics: dynamics of the state.
-        lower, upper: (d,) limits of the pose at every time; None: none.
-        points: maps poses (N, d) to points (N, P, 3), m, that separate motions; None: the variables
-            of the pose.
+        lower, upper: (d,) limits of the pose at every time; None: no limits.
+        points: maps poses (N, d) to points (N, P, 3), m, by which motions are compared; None: the
+            variables of the pose.
         max_motions: maximum number of motions.
         resting: points that may rest on the ground; None: not used.
         seed: random seed of the drawn paths.
@@ -221,7 +222,7 @@ class MotionSmoother:
         return np.asarray(found.reshape(*poses.shape[:-1], *found.shape[1:]))
 
     def image(self, modes: ImageModes, before_ns: int | None) -> WindowImage:
-        """Prepare an image of a window that follows one at `before_ns`; None for the first.
+        """Prepare an image of a window; `before_ns` is the last stamp, None for the first image.
 
         Raises:
             ValueError: the modes can not be smoothed, or the stamp does not increase.
@@ -318,7 +319,7 @@ class MotionSmoother:
     def _with_weights_in_time(
         self, found: TrajectoryMixture, images: Sequence[WindowImage], shares: Sequence[Array]
     ) -> TrajectoryMixture:
-        """Give trajectories weights at each time: those of the modes nearest to each."""
+        """Add weights at each time: the sum over the modes nearest to each trajectory."""
         smoothed = backward_weights([image.modes.link for image in images])
         every = self.points_of(found.means).swapaxes(0, 1)
         weights, strays = np.zeros((found.times, len(found))), []
@@ -387,7 +388,7 @@ class MotionSmoother:
         seen += 0.5 * product(at, pull_of_first) + couplings.constant(noise)
         gained = 0.5 * (product(states[0], pull_of_first) + (states[:, :d] * pull).sum())
         if held and self.resting is not None and len(states) > 1:
-            # Covariances ignore resting points: rest is a decision, the same from image to image.
+            # Covariances ignore resting points, because rest is one decision for all images.
             poses = np.clip(states, *self.limits())[:, :d]
             resting = self.resting.along(poses, evidence.covariances[m], intervals)
             if resting is not None:
@@ -395,17 +396,17 @@ class MotionSmoother:
         return MotionStates(states, factor, float(gained - seen), liveliness, trust, fresh)
 
     def _away(self, states: Array, places: Array) -> Array:
-        """Mean distances (T,) of the points of states (T, n) from others (T, P, 3), m."""
+        """Mean distances (T,) between the points of states (T, n) and points (T, P, 3), m."""
         poses = np.clip(states, *self.limits())[:, : self.dynamics.dimension]
         return np.asarray(mean_distances(self.points_of(poses), places))
 
     def advanced(self, found: SmoothedMotions, count: int, after: ImageModes) -> Past:
-        """Predict the image after the first images of a window.
+        """Predict the image that follows the images which leave a window.
 
         Args:
             found: the motions of the window.
             count: number of images that leave the window.
-            after: the image that follows these.
+            after: the next image after the leaving ones.
         """
         dynamics, evidence = self.dynamics, found.evidence
         d = dynamics.dimension
@@ -452,7 +453,7 @@ def _shares(nodes: Index, weights: Array, labels: Index, count: int, masses: Arr
 def _conditioned(
     prior: ChainPrior, precisions: Array, means: Array, resting: RestingTable | None = None
 ) -> tuple[Array, BlockCholesky]:
-    """Return states (T, n) given Gaussians over poses, and the factor of their precision.
+    """Return states (T, n) given Gaussians over poses, and the Cholesky factor of their precision.
 
     Args:
         precisions, means: (T, d, d) and (T, d) of the Gaussians over poses.

@@ -4,15 +4,16 @@
     z_t = sum_k r_k x_k,  R_t = sum_k r_k (S_k / b + (x_k - z_t)(x_k - z_t)')               (2)
 
 a_sj is the mean position of joint j over span s, a sixth of a second; a moment is three successive
-spans. Paths closer than 30 mm are one motion. The mean is of squares, so that one differing limb is
-not lost among equal joints. A span counts at most c = 90 mm: a difference in a single span makes no
-separate motion, however large it is. The origin of a path is an extra span before the first. Spans
-without an image are skipped; in a window shorter than a moment the mean is over the window.
+spans. Paths closer than 30 mm are one motion. The mean is over squares, so that one differing limb
+is not lost among equal joints. The distance in a span is limited to c = 90 mm, so that a difference
+in a single span, however large, does not separate two motions. The past motion that a path
+continues gives an extra span before the first. Spans without an image are skipped; in a window
+shorter than a moment the mean is over the window.
 
-A motion's modes in an image are merged to one Gaussian (2); r_k is the share of its paths through
-mode k. Modes far from the heaviest one are left out, because the mean of two opposite poses is no
-pose. b is the image's share of evidence on changes (`CueErrors.of_changes`). R includes the
-disagreement of the modes.
+A motion's modes in an image are merged into one Gaussian (2); r_k is the fraction of the motion's
+paths through mode k. Modes far from the heaviest mode are left out, because the mean of two
+opposite poses is no pose. b is the image's share of evidence on changes (`CueErrors.of_changes`). R
+includes the covariance between the modes.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import distances, mean_distances, product
 
 SECOND_NS = 10**9
-# Distance below which two paths are one motion, and maximum distance of a span, m.
+# Distance below which two paths are one motion, and limit c of the distance in a span, m.
 SAME_MOTION, MOST_APART = 0.03, 0.09
 # Distance above which two modes of an image are not merged, m.
 OPPOSITE = 0.1
@@ -39,8 +40,8 @@ class MotionEvidence(NamedTuple):
     """Evidence of the images of a window on M motions, equation (2).
 
     Attributes:
-        means: (M, T, d).
-        covariances: (M, T, d, d).
+        means: (M, T, d) z_t of each motion.
+        covariances: (M, T, d, d) R_t of each motion.
         disagreements: (M, T, d, d) covariance between the merged modes, part of the covariances.
     """
 
@@ -52,11 +53,11 @@ class MotionEvidence(NamedTuple):
 def path_distances(
     nodes: Index, points: Sequence[Array], stamps: Sequence[int], before: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return distances (N, N) of paths, equation (1), and means over all spans with c infinite, m.
+    """Return distances (N, N) of paths, m: equation (1), and unlimited means over all spans.
 
     Args:
         nodes: (N, T) modes of the paths.
-        points: T arrays (K_t, P, 3) of the modes, m.
+        points: T arrays (K_t, P, 3), points of the modes, m.
         stamps: (T,) stamps of the images, ns.
         before: (N, P, 3) points of each path in the span before the first, m; None: unknown.
     """
@@ -69,7 +70,7 @@ def path_distances(
     if before is not None:
         apart[max(apart) + 1] = _apart([before])
     known = np.array([*apart])
-    # The oldest span of each moment that has distinct images.
+    # Oldest span of each moment; moments with the same images count once.
     ends = np.unique([known, known + MOMENT - 1]).clip(MOMENT - 1).clip(max=known.max())
     most = np.zeros((len(nodes), len(nodes)))
     for end in np.unique(ends):
@@ -88,14 +89,14 @@ def _apart(places: Sequence[Array]) -> Array:
 def grouped(weights: Array, distances: Array, means: Array, most: int, least: float) -> Index:
     """Return the motion (N,) of each path, numbered by weight.
 
-    Motions are found one by one: the path with the most weight within `SAME_MOTION` is the next
-    leader. Every path belongs to the leader with the least mean distance.
+    Motions are found one by one: the path with the largest total weight of paths within
+    `SAME_MOTION` is the next leader. Every path belongs to the leader at the least mean distance.
 
     Args:
-        weights: (N,) of paths, which sum to 1.
-        distances, means: (N, N) of paths, m, see `path_distances`.
+        weights: (N,) weights of the paths, with sum 1.
+        distances, means: (N, N) distances of the paths, m, see `path_distances`.
         most: maximum number of motions.
-        least: minimum weight of a motion; the paths of lighter motions go to the others.
+        least: minimum weight of a motion; paths of lighter motions are given to the others.
     """
     near, left, leaders = distances <= SAME_MOTION, weights.copy(), list[int]()
     while len(leaders) < most and left.any():
@@ -123,7 +124,7 @@ def evidence_of_motions(
 
     Args:
         nodes: (N, T) modes of the paths.
-        weights, labels: (N,) of the paths, and the motion of each.
+        weights, labels: (N,) weight and motion of each path.
         mixtures: T likelihoods, with covariances S_k / b.
         points: T arrays (K_t, P, 3), points of the modes, m; None: all modes are merged.
     """

@@ -1,9 +1,9 @@
 """Smoothing while observations arrive: a window of fixed lag.
 
-The window contains the newest images. The evidence of the images before it is kept as a state for
-each motion (`Past`), so that the cost per image does not depend on the length of the sequence. A
-pose becomes final before its age relative to the newest pose exceeds the lag plus the time between
-two smoothings.
+The window contains the newest images. The evidence of earlier images is kept as a state for each
+motion (`Past`), so that the cost per image does not depend on the length of the sequence. A pose
+becomes final before it is older than the newest pose by more than the lag plus the time between two
+smoothings.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ class FinalPose:
     """A pose that will not be revised.
 
     Attributes:
-        stamp_ns: its time.
+        stamp_ns: time of the pose, ns.
         trajectories: the M trajectories of the window.
-        t: its index in the window.
+        t: index of the pose in the window.
     """
 
     stamp_ns: int
@@ -74,7 +74,7 @@ class WindowUpdate:
     """Result of a new observation.
 
     Attributes:
-        trajectories: the mixture over the poses in the window; None: it was not smoothed.
+        trajectories: the mixture over the poses in the window; None: the window was not smoothed.
         final: poses that have become final, oldest first.
     """
 
@@ -85,13 +85,13 @@ class WindowUpdate:
 class SlidingWindow:
     """Smooths the modes of images as they arrive.
 
-    Keeps the window's images, and the motions found last. The same images in the same order give
-    the same numbers.
+    Keeps the images of the window and the motions of the last smoothing. Deterministic: the same
+    images in the same order give the same numbers.
 
     Args:
-        fixed_lag: maximum age of a pose relative to the newest one when it becomes final, s; it
-            becomes final if the next image, expected after the same interval, would exceed this. 0
-            is filtering; infinite: nothing is final before the end.
+        fixed_lag: maximum age of a pose relative to the newest pose, s; a pose becomes final if the
+            next image, expected after the same interval, would make it older. 0 is filtering;
+            infinite: no pose is final before the end.
         every: minimum time between two smoothings, s; poses become final only in a smoothing.
 
     Attributes:
@@ -122,7 +122,7 @@ class SlidingWindow:
         self._past: Past | None = None
         self._found: SmoothedMotions | None = None
         self._last: TrajectoryMixture | None = None
-        # Number of oldest images of the window that are final.
+        # Number of final images, the oldest of the window.
         self._final = 0
 
     @property
@@ -171,14 +171,14 @@ class SlidingWindow:
             self._final = 0
 
     def _is_due(self, interval: float) -> bool:
-        """Whether the window is smoothed now, an interval after the pose before, s."""
+        """Whether to smooth the window now, `interval` s after the last pose."""
         if self._last is None or self._last.stamps_ns is None:
             return True
         since = (self.stamps_ns[-1] - self._last.stamps_ns[-1]) / SECOND_NS
         return since >= self.every - TREMBLE * interval
 
     def _number_of_final(self) -> int:
-        """Return the number of oldest poses of the window that are final."""
+        """Return the number of final poses, which are the oldest of the window."""
         stamps = self.stamps_ns
         if self.fixed_lag == math.inf:
             return 0
@@ -193,7 +193,7 @@ class SlidingWindow:
         return sum(stamp < until for stamp in stamps[:-1])
 
     def finish(self) -> tuple[FinalPose, ...]:
-        """Return the remaining poses as final ones, and clear the window."""
+        """Return the remaining poses, which are now final, and clear the window."""
         last, stamps = self._last, self.stamps_ns
         if last is None or last.stamps_ns is None:
             return ()
@@ -213,9 +213,9 @@ class SlidingWindow:
     def _identities(self, found: TrajectoryMixture) -> tuple[int, ...]:
         """Return identities of trajectories, inherited from predecessors, heaviest first.
 
-        The predecessor is the trajectory of the last smoothing, closer than `SAME_MOTION` and
-        without a heavier successor, that has the least distance over its weight. Without one, the
-        motion is new.
+        The predecessor is a trajectory of the last smoothing that is closer than `SAME_MOTION` and
+        has no heavier successor; of several, the one with the least distance divided by its weight.
+        A trajectory without predecessor gets a new identity.
         """
         numbers = np.zeros(len(found), dtype=np.int64)
         away, before = self._distances(found)
@@ -232,8 +232,8 @@ class SlidingWindow:
     def _distances(self, found: TrajectoryMixture) -> tuple[Array, tuple[int, ...]]:
         """Return distances (M, L) from the last L trajectories, and their identities.
 
-        They are means over the points and the common times, divided by the weight of the last
-        trajectory; infinite beyond `SAME_MOTION`.
+        A distance is the mean over the points and the common times, divided by the weight of the
+        last trajectory, and infinite beyond `SAME_MOTION`.
         """
         last = self._last
         common = 0 if last is None else len({*self.stamps_ns} & {*(last.stamps_ns or ())})
@@ -248,6 +248,6 @@ class SlidingWindow:
 
 
 def _final_poses(found: TrajectoryMixture, indices: Sequence[int]) -> tuple[FinalPose, ...]:
-    """The poses at some indices."""
+    """The final poses at the given indices."""
     assert found.stamps_ns is not None
     return tuple(FinalPose(found.stamps_ns[t], found, t) for t in indices)

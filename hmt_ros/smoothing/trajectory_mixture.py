@@ -3,7 +3,7 @@
     q(X) = sum_i a_i N(X; M_i, s_i^2 P_i^-1)
 
 Every component is a Gaussian Markov process with block-tridiagonal precision P_i, so that
-densities, samples and marginals cost O(T) and no (T d, T d) covariance exists. Where the state has
+densities, samples and marginals cost O(T) and no (T d, T d) covariance is needed. If the state has
 velocities, they are integrated out of all results.
 """
 
@@ -32,25 +32,25 @@ class TrajectoryMixture:
     """M trajectories of T poses with d variables, heaviest first.
 
     Attributes:
-        weights: (M,) sum to 1.
+        weights: (M,) probabilities of the trajectories, with sum 1.
         states: (M, T, n) means; the first d of the n variables are the pose.
         factors: M factors of the precisions P_i, without inflation.
         inflation: (M,) s_i, factor on standard deviations.
         log_joint: (M,) log p(M_i, R) at the means.
-        free_energy: (I,) per iteration, nats, on the samples of the descent.
+        free_energy: (I,) free energy at each iteration, on the samples of the descent, nats.
         dimension: d, number of variables of a pose.
         stamps_ns: (T,) times, ns; None: unknown.
         final_until_ns: poses at or before this time will not be revised.
-        identities: (M,) numbers from 1, constant over windows for each motion; empty for a single
-            window, whose trajectories have no identity.
+        identities: (M,) number of each motion, from 1 on, the same in all windows; empty if a
+            single window was smoothed.
         free_energy_fresh: free energy on samples not used in the descent, and its standard error.
         lower, upper: (d,) limits; samples are clipped to them.
-        disagreements: (M, T, d, d) covariance between the modes of each motion; it is added to the
-            marginals only. None: components are not motions.
+        disagreements: (M, T, d, d) covariance between the modes of each motion, added only to the
+            marginals. None: components are not motions.
         weights_in_time: (T, M) total probability of the modes near each motion at each time; None:
-            the weights.
-        strays: T mixtures of modes far from all motions, with their probabilities; they are the
-            last components of the marginals. Empty if missing.
+            `weights` at all times.
+        strays: T mixtures of the modes far from all motions, with their probabilities; they become
+            the last components of the marginals. Empty if missing.
 
     Raises:
         ValueError: shapes are inconsistent, or weights do not sum to 1.
@@ -104,11 +104,11 @@ class TrajectoryMixture:
 
     @cached_property
     def marginal_covariances(self) -> Array:
-        """Covariances of each pose in each component, inflation included, (M, T, d, d)."""
+        """Covariances (M, T, d, d) of the poses in each component, inflation included."""
         return np.array([self.covariances_of(i) for i in range(len(self))])
 
     def covariances_of(self, i: int, count: int | None = None) -> Array:
-        """Covariances (T, d, d) of the poses of component i, or of the first of them."""
+        """Covariances (T, d, d) of the poses of component i, or of its first `count` poses."""
         d = self.dimension
         blocks = self.factors[i].inverse_blocks(count)
         result: Array = self.inflation[i] ** 2 * blocks[:, :d, :d]
@@ -118,8 +118,8 @@ class TrajectoryMixture:
     def velocities(self) -> Array | None:
         """Velocities of the poses, (M, T, d) per second; None: unknown.
 
-        They are those of the states or, if the state is only a pose, central differences, one-sided
-        at the ends.
+        They are part of the states; if a state is only a pose, they are central differences,
+        one-sided at the ends.
         """
         if self.states.shape[2] == 2 * self.dimension:
             return self.states[:, :, self.dimension :]
@@ -131,8 +131,8 @@ class TrajectoryMixture:
     def marginal(self, t: int) -> GaussianMixture:
         """The density of the pose at index t: a component for each trajectory, and the strays.
 
-        For motions, the heaviest one has the largest weight at every time; see `led_by_first`.
-        Another motion that is heavier in a single image is flicker.
+        If trajectories are motions, the heaviest motion has the largest weight at every time; see
+        `led_by_first`. If another motion were heavier in a single image, estimates would flicker.
         """
         covariances = np.array([self.covariances_of(i, t + 1)[t] for i in range(len(self))])
         weights = self.weights if self.weights_in_time is None else self.weights_in_time[t]
@@ -155,10 +155,10 @@ class TrajectoryMixture:
         return np.clip(result, self.lower, self.upper)
 
     def log_density(self, trajectories: ArrayLike) -> Array:
-        """log q(X), shape (n,), of trajectories X (n, T, d).
+        """Log densities log q(X), (n,), of trajectories X (n, T, d).
 
         Raises:
-            ValueError: trajectories of another shape.
+            ValueError: the trajectories have another shape.
         """
         x = np.asarray(trajectories, dtype=np.float64)
         if x.ndim != 3 or x.shape[1:] != (self.times, self.dimension):
@@ -173,7 +173,7 @@ class TrajectoryMixture:
         return result
 
     def _component_log_density(self, i: int, x: Array) -> Array:
-        """log N(X; M_i, s_i^2 S_i) (n,) with velocities integrated out.
+        """Log density log N(X; M_i, s_i^2 S_i), (n,), with velocities integrated out.
 
         q(x) = q(x, v*) (2 pi)^(D/2) |P_vv|^(-1/2) at the most probable velocities v* given x.
         """
@@ -197,7 +197,7 @@ class TrajectoryMixture:
         return np.asarray(np.einsum('m,mtd->td', self.weights, self.means))
 
     def message_content(self, *, covariances: bool = True) -> dict[str, Any]:
-        """Content of a message besides names and frame (`msg_tools.messages`).
+        """Content of a message, except names and frame (`msg_tools.messages`).
 
         Args:
             covariances: whether to compute and include covariances.
@@ -231,10 +231,9 @@ def joined(one: GaussianMixture, other: GaussianMixture) -> GaussianMixture:
 
 
 def led_by_first(weights: Array) -> Array:
-    """Reduce weights (K,) above the first one, keeping their sum.
+    """Lower weights (K,) that exceed the first one, without changing their sum.
 
-    The excess of other weights above a level is added to the first weight, which then equals that
-    level.
+    The other weights are cut at a level. Their excess raises the first weight to this level.
     """
     heavier = -np.sort(-weights[1:][weights[1:] > weights[0]])
     levels = (weights[0] + np.cumsum(heavier)) / np.arange(2, len(heavier) + 2)

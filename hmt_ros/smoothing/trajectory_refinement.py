@@ -1,4 +1,4 @@
-"""Trajectories of locally maximal posterior density (VMS 5, equations numbered as there).
+"""Trajectories of locally maximal posterior density (VMS 5, with its equation numbers).
 
     E(X) = -log p(x_1) - sum_t log p(x_t | x_{t-1}) - sum_t log p(r_t | x_t)       -log of (1)
 
@@ -44,16 +44,15 @@ class RefinedTrajectories:
     """Optima of the energy of trajectories, one for each start.
 
     Attributes:
-        states: (M, T, n).
+        states: (M, T, n) states at the optima.
         energies: (M,) energies E, nats.
-        observation_energies: (M,) the part of the observations, - sum log p(r_t | x_t), nats.
+        observation_energies: (M,) the observations' part of E, - sum log p(r_t | x_t), nats.
         free: (M, T, n) whether a variable is not fixed at a limit.
-        status: (M,) of `Status`.
+        status: (M,) values of `Status`.
         iterations: (M,) number of evaluations after the first.
-        factors: M Cholesky factors of the precision at the optimum. A variable at a limit gets the
-            precision of its slope: the density falls off as exp(-g distance), which has variance 1
-            / g^2.
-        starts: (M,) index of the start of each optimum.
+        factors: M Cholesky factors of the precision at the optimum. A variable fixed at a limit
+            with slope g gets the extra precision g^2, because exp(-g distance) has variance 1/g^2.
+        starts: (M,) index of the initial trajectory of each optimum.
     """
 
     states: Array
@@ -84,8 +83,8 @@ class RefinedTrajectories:
     def without_duplicates(self, distance: float = 0.1) -> RefinedTrajectories:
         """Return distinct optima, the most probable first.
 
-        Two optima are the same if their energies, nats, and their states, in standard deviations of
-        the more probable one, differ by less than a distance.
+        Two optima are the same if their energies, in nats, and their states, in standard deviations
+        of the more probable optimum, differ by less than `distance`.
         """
         order = np.argsort(self.energies, kind='stable')
         kept: list[int] = []
@@ -144,7 +143,7 @@ def refine(
 
 
 class _Problem:
-    """The joint minimisation of several trajectories: their states and step controls."""
+    """Joint minimisation of several trajectories, with their states and step controls."""
 
     def __init__(
         self,
@@ -171,7 +170,7 @@ class _Problem:
         self.status[~np.isfinite(self.energy)] = Status.NOT_FINITE
 
     def minimise(self, max_iterations: int, tolerance: float) -> None:
-        """Iterate until every trajectory has converged, stalled or used its iterations."""
+        """Iterate until every trajectory has converged, stalled or reached its iteration limit."""
         active = np.flatnonzero(self.status == Status.ITERATION_LIMIT)
         for _ in range(max_iterations + 1):
             step, predicted = self._steps(active)
@@ -253,8 +252,8 @@ class _Problem:
             positive = self._evaluate(self.states[active[failed]], Derivatives.POSITIVE)[3]
             for row, hessian in zip(failed, positive):
                 i = active[row]
-                # Indefinite: use the least share of the positive Hessian that makes it positive
-                # definite.
+                # Blend an indefinite Hessian with the smallest share of the positive one that makes
+                # the sum positive definite.
                 if self.exact[i] and any(
                     self._step(
                         i,
@@ -322,7 +321,7 @@ class _Problem:
 def limits_of_states(
     lower: ArrayLike, upper: ArrayLike, dimension: int, size: int
 ) -> tuple[Array, Array]:
-    """Extend limits (d,) of the poses to limits (n,) of the states; velocities have none.
+    """Extend limits (d,) of the poses to limits (n,) of the states, without limits of velocities.
 
     Raises:
         ValueError: limits have the wrong dimension, or a lower limit is above the upper one.

@@ -11,18 +11,18 @@ expectation is over samples
 
     X = M_i + s_i L_i'^-1 z
 
-with the same antithetic noise z throughout, so that the sampled F is smooth with exact gradients
-and its descent is repeatable; the reported F uses fresh samples and has a standard error. Variables
-are scaled by the curvature that F would have if the posterior were q: means by L_i sqrt(a_i), log
-s_i by sqrt(2 D a_i).
+with the same antithetic noise z throughout, so that the sampled F is smooth, its gradients are
+exact and its descent is repeatable. The reported F uses fresh samples and has a standard error.
+Variables are scaled by the curvature that F would have if the posterior were q: means by L_i
+sqrt(a_i), log s_i by sqrt(2 D a_i).
 
-Most components are far from each other, and such pairs are skipped: the samples of i that j is
-responsible for have at most the probability
+Most components are far from each other, and such pairs are skipped. The expected responsibility of
+j for samples of i is at most
 
     E_i[a_j q_j / (a_i q_i + a_j q_j)] <= (a_j / a_i)^(1/2) / 2 int (q_i q_j)^(1/2)
 
-and the overlap of two trajectories is at most that of their poses at any one time, for Gaussians at
-most exp(-1/4 D'(C_i + C_j)^-1 D). Pairs below exp(-30) are left out.
+The overlap of two trajectories is at most the overlap of their poses at any one time, which for
+Gaussians is at most exp(-1/4 D'(C_i + C_j)^-1 D). Pairs below exp(-30) are skipped.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ from hmt_ros.inference.threads import together
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
 ADAPTABLE = ('weights', 'means', 'inflation')
-# Number of parts that components are split into; fixed, so that sums keep their order.
+# Number of parts into which components are split; fixed, so that sums keep their order.
 PARTS = 4
 # Maximum number of successive iterations without a gain on held-out samples.
 PATIENCE = 3
-MEMORY = 8  # number of pairs of steps and gradients
-# Minimum proportion in the scale of a component's variables.
+MEMORY = 8  # number of past steps in L-BFGS
+# Minimum proportion for the scale of a component's variables.
 LEAST_WEIGHT = 1e-4
 # Minus the logarithm of a negligible overlap.
 NEGLIGIBLE = 30.0
@@ -64,13 +64,13 @@ class VariationalMixture:
     """A mixture over trajectories of states, with the trace of its optimisation.
 
     Attributes:
-        weights: (M,) a_i.
-        states: (M, T, n) M_i.
-        inflation: (M,) s_i.
+        weights: (M,) proportions a_i.
+        states: (M, T, n) means M_i.
+        inflation: (M,) factors s_i on standard deviations.
         free_energy: (I,) F at the start and after each iteration, on the samples of the descent,
             nats.
-        held_out: (J,) the same on the samples that choose the iterate, J >= I, because the descent
-            continues for a while after the best one; empty without a descent.
+        held_out: (J,) F on the held-out samples that select the iterate, nats; J >= I, because the
+            descent continues for some iterations after the best one. Empty without a descent.
         fresh: F on unused samples, and its standard error, nats.
     """
 
@@ -109,7 +109,7 @@ def minimise_free_energy(
     Args:
         weights: (M,) proportions.
         states: (M, T, n) means.
-        adapt: some of `ADAPTABLE`.
+        adapt: names of the adapted variables, some of `ADAPTABLE`.
         low, high: (n,) limits of the means.
         samples: number of samples per component, even.
         max_iterations: maximum number of L-BFGS iterations; 0 evaluates only.
@@ -168,8 +168,8 @@ def _descend(
 ) -> tuple[Array, Array, Array]:
     """Run L-BFGS from 0; return the best iterate, F up to it, and F on held-out samples.
 
-    With few samples the descent fits their noise. The iterate with the least F on held-out samples
-    is kept, and the descent ends when F no longer falls on those.
+    With few samples the descent fits their noise. Therefore the iterate with the least F on
+    held-out samples is kept, and the descent ends when F on these samples no longer falls.
     """
     best = start = np.zeros(objective.parameters)
     first = objective(start)
@@ -204,7 +204,7 @@ Mixture = tuple[Array, Array, Array]
 
 
 class FreeEnergy:
-    """F on fixed samples as a function of unconstrained numbers, 0 at the start."""
+    """F on fixed samples as a function of unconstrained variables, which are 0 at the start."""
 
     def __init__(
         self,
@@ -247,11 +247,11 @@ class FreeEnergy:
         self.roots = self._coloured(noise)
 
     def _coloured(self, noise: Array) -> Array:
-        """L_i'^-1 z, (M, ..., D), of vectors z (M, ..., D)."""
+        """Products L_i'^-1 z, (M, ..., D), for vectors z (M, ..., D)."""
         return np.stack([factor.solve_transposed(z) for factor, z in zip(self.factors, noise)])
 
     def mixture(self, x: Array) -> Mixture:
-        """The mixture at a point."""
+        """The mixture for values x of the unconstrained variables."""
         log = self.log_weights
         if 'weights' in self.slices:
             log = log + x[self.slices['weights']] / self.scale
@@ -267,7 +267,7 @@ class FreeEnergy:
         return elementary.exp(log - log_sum_exp(log)), means, inflation
 
     def sampled(self, mixture: Mixture, noise: Array) -> Array:
-        """log q(X) - log p(X, R) at samples of each component, (M, S), with noise (M, S, D)."""
+        """Values (M, S) of log q(X) - log p(X, R) at samples from noise (M, S, D)."""
         return self._evaluate(mixture, noise, self._coloured(noise), derivatives=False)[0]
 
     def __call__(self, x: Array) -> tuple[float, Array]:
@@ -295,7 +295,7 @@ class FreeEnergy:
     def _evaluate(
         self, mixture: Mixture, noise: Array, roots: Array, *, derivatives: bool = True
     ) -> tuple[Array, Array, tuple[Array, ...]]:
-        """log q - log p at samples (M, S), its gradient, and those of log q at fixed samples."""
+        """Values (M, S) of log q - log p, gradients, and gradients of log q at fixed samples."""
         weights, means, inflation = mixture
         count, samples, total = noise.shape
         log_scales = 0.5 * self.log_determinants - total * (
@@ -337,7 +337,7 @@ class FreeEnergy:
         return each, slope, tuple(sum(column[1:], start=column[0]) for column in zip(*sums))
 
     def _energy(self, points: Array) -> tuple[Array, Array]:
-        """-log p(X, R) (S,) and its gradient (S, D) at trajectories (S, D)."""
+        """Energies -log p(X, R), (S,), and gradients (S, D) at trajectories (S, D)."""
         s, d = len(points), self.prior.dimension
         gradient = np.zeros_like(points)
         add_band_product(self.band, points, gradient)
@@ -352,9 +352,9 @@ class FreeEnergy:
         return value + found.value.reshape(s, self.times).sum(1), gradient
 
     def _near(self, means: Array, inflation: Array) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-        """Return (M, M) whether components may overlap, by marginals at the time they differ most.
+        """Return (M, M) whether components may overlap at the time at which they differ most.
 
-        Also return this time, (M, M).
+        Also return the index of this time, (M, M).
         """
         near = np.ones((self.count, self.count), dtype=bool)
         metric = self.bands[:, :, 0] ** 2

@@ -1,12 +1,11 @@
-"""Usual appearance of one person, in silhouettes and colours, and whether an image shows it.
+"""Usual silhouette and colours of a person, and their evidence in an image.
 
     place    share of the model that is foreground / usual share
     area     area of the largest piece of the foreground that has the shape of one person / usual
 
 If the clothes have the colours of the room, only a part of the model is foreground, so the share is
-compared with that of earlier images of the track. A person who has not been seen for a time t may
-be RUNNING_SPEED t further away; the usual area shrinks accordingly. For colours see
-`image.person_colours`.
+compared with that of earlier images of the track. A person unseen for a time t may be RUNNING_SPEED
+t further away; the usual area shrinks accordingly. For colours see `image.person_colours`.
 """
 
 from __future__ import annotations
@@ -37,12 +36,12 @@ from hmt_ros.tracking.settings import MAJORITY, UNDECIDED_FRACTION
 
 
 class Silhouetted(NamedTuple):
-    """Evidence of a silhouette for the presence of a person, from -1, nobody, to 1.
+    """Evidence of a silhouette for a person in view: -1 is nobody, 1 is a person.
 
     Attributes:
-        by_place: from the share of the model that is foreground.
-        by_area: from the largest piece that has the shape of a person, anywhere.
-        cut: whether a side of the image may cut that piece.
+        by_place: evidence from the share of the model that is foreground.
+        by_area: evidence from the largest piece anywhere that has the shape of a person.
+        cut: whether the image border may cut the largest piece.
     """
 
     by_place: float
@@ -51,15 +50,15 @@ class Silhouetted(NamedTuple):
 
     @property
     def evidence(self) -> float:
-        """The larger of both: a person in a wrong pose is not absent."""
+        """Larger evidence of place and area: a model in a wrong pose is not an absent person."""
         return max(self.by_place, self.by_area)
 
 
 class Appearance:
-    """The usual appearance of one person.
+    """Usual appearance of one person.
 
     Attributes:
-        colours: of the person.
+        colours: colours of the person.
     """
 
     def __init__(self) -> None:
@@ -74,22 +73,22 @@ class Appearance:
         self._piece: Piece | None = None
 
     def open_to_view(self, others: Mask | None) -> float:
-        """Share of the person, at the last known place, that others (H, W) do not cover."""
+        """Share of the model's last area in the image that other people (H, W) do not cover."""
         if self._model is None or others is None:
             return 1.0
         hidden = counted(self._model & on_raster(others, self._model))
         return 1.0 - hidden / max(counted(self._model), 1)
 
     def unseen(self, stamp: int) -> float:
-        """Time from the last sight of the person to a stamp, ns, in s; 0 if never seen."""
+        """Time since the person was last seen, s, at a timestamp, ns; 0 if never seen."""
         return 0.0 if self._model is None else seconds(stamp - self._stamp)
 
     def silhouetted(self, view: View, stamp: int) -> Silhouetted | None:
-        """Evidence of the silhouette; None without one, or if most of the image has changed.
+        """Evidence of the silhouette; None without silhouette, or if most of the image has changed.
 
         Args:
-            view: of the image.
-            stamp: of the image, ns.
+            view: view of the image.
+            stamp: timestamp of the image, ns.
         """
         self._foreground, self._piece = None, None
         if view.anywhere is None:
@@ -99,7 +98,7 @@ class Appearance:
             return None
         foreground, others = view.anywhere, view.others
         if others is not None and view.silhouette is not None:
-            # Others may be in view: only foreground near the person counts.
+            # Other people may be in view, so only foreground near the person counts.
             foreground = on_raster(view.silhouette, foreground)
             model = model & ~on_raster(others, model)
         self._foreground = foreground
@@ -115,9 +114,10 @@ class Appearance:
         )
 
     def colour_evidence(self, view: View) -> tuple[bool, float] | None:
-        """Whether colours speak for or against a person, with a weight of 0 to 1; None if unknown.
+        """Whether colours are evidence for the person, and its weight, 0 to 1; None if unknown.
 
-        Evidence against a person has weight 0 in another scene than that of the last learning.
+        Evidence against a person has weight 0 if the scene has changed since the colours were
+        learned.
         """
         image = _coarse(view)
         score = self.colours.score(image)
@@ -132,13 +132,13 @@ class Appearance:
         return False, against * self.colours.stillness(image)
 
     def motion(self, view: View) -> Motion:
-        """Motion in the image since the last learned one; see `Colours.motion`."""
+        """Motion since the image that was learned last; see `Colours.motion`."""
         return self.colours.motion(_coarse(view))
 
     def is_apart(self, view: View, stamp: int) -> bool:
-        """Whether most keypoints lie outside the box around the model, within the person's reach.
+        """Whether most keypoints are outside the model's box, but within the person's reach.
 
-        Keypoints further away are an error of the detector, or another person.
+        Keypoints beyond that reach are an error of the detector, or another person.
         """
         keypoints = view.keypoints
         if keypoints is None or self._model is None or not keypoints.seen.any():
@@ -151,7 +151,7 @@ class Appearance:
         return bool(0.25 * max(width, height) < np.median(away) < way)
 
     def learn(self, view: View, stamp: int, body: Body, camera: Camera, pose: Array) -> None:
-        """Learns from an image with the person at a pose (d,), after a call of `silhouetted`."""
+        """Learns the appearance from an image and a pose (d,); requires a call of `silhouetted`."""
         dt = 0.0 if self._model is None else seconds(stamp - self._stamp)
         gain = -float(elementary.expm1(-dt / MEMORY_TIME))
         self._model = model = covered(body, camera, pose, raster_step(camera.height))
@@ -177,12 +177,12 @@ class Appearance:
 
 
 def _coarse(view: View) -> Image:
-    """The image on the raster."""
+    """Image on the coarse raster."""
     step = raster_step(len(view.image))
     height, width = (-(-x // step) for x in view.image.shape[:2])
     return on_raster(view.image, np.empty((height, width), np.bool_))
 
 
 def _evidence(value: float) -> float:
-    """Evidence, from -1 to 1, of a value relative to the usual one."""
+    """Evidence, from -1 to 1, given the ratio of a value to its usual value."""
     return min(max(value / UNDECIDED_FRACTION - 1.0, -1.0), 1.0)

@@ -1,6 +1,6 @@
-"""The start of a track: a table of possible sources; the first available one decides.
+"""Start of a track: a table of possible sources, of which the first available one is used.
 
-    source        needs                                             sure (nats, beside existence)
+    source        needs                                             sure (nats, plus existence)
     subject       a subject file, and an image at or after it       given
     mixture       a given mixture                                   given
     keypoints     most of the trunk, and 6 joints in all            -
@@ -13,14 +13,14 @@ A track starts once
 
     log odds of existence + sure + log p(distance) >= log odds of PRESENT_PROBABILITY
 
-p(distance) is log-normal, wide, and never a limit: a lens of 60 degrees sees people at 0.4 to 15 m,
-and the distances grow with the focal length. After a track has ended, a silhouette before a known
-scene suffices, too.
+p(distance) is log-normal and wide, without a limit: a lens of 60 degrees sees people at 0.4 to 15
+m, and these distances grow with the focal length. After the end of a track, a silhouette in front
+of a known scene suffices, too.
 
-Keypoints give poses, depth and lengths (see `initialisation`); a mask or a box gives mean poses of
-several headings. A detector may confuse left and right, and silhouettes do not distinguish sides,
-so the reversal in depth of the poses is a hypothesis too, and both facing directions are tracked
-(see `classes`).
+Keypoints give poses, depth and lengths (see `initialisation`); a mask or a box gives mean poses at
+several headings. A detector may confuse left and right, and silhouettes do not distinguish sides.
+So the poses reversed in depth are hypotheses too, and both facing directions are tracked (see
+`classes`).
 """
 
 from __future__ import annotations
@@ -62,15 +62,15 @@ from hmt_ros.tracking.initialisation import (
 from hmt_ros.tracking.observer import View
 from hmt_ros.tracking.settings import MAX_STARTS, PRESENT_PROBABILITY, SAME_MOMENT
 
-# Log odds of existence by a prediction itself, nats: a first image may have no other evidence.
+# Log odds of existence from a prediction, nats: a first image may have no other evidence.
 AT_ONCE = 1.5 * CLEAR.nats
 PRESENT_LOG_ODDS = float(elementary.log(PRESENT_PROBABILITY / (1.0 - PRESENT_PROBABILITY)))
-# Maximum number of best poses from keypoints whose reversals in depth are added.
+# Number of keypoint poses, best first, whose depth reversals become hypotheses too.
 REVERSED = MAX_STARTS // 4
 
 
 class Source(Enum):
-    """The input that a track began from."""
+    """Input from which a track started."""
 
     SUBJECT = 'the subject file'
     MIXTURE = 'a mixture'
@@ -81,22 +81,22 @@ class Source(Enum):
     ARRIVAL = 'who has come into view'
 
 
-# Starts with a best pose near the person's, and starts that may rest on silhouettes alone.
+# Sources whose best pose is near the person, and sources possibly based on silhouettes alone.
 FROM_JOINTS = (Source.SUBJECT, Source.KEYPOINTS)
 FROM_SILHOUETTES = (Source.PREDICTION, Source.ARRIVAL)
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """An image, and the start that the user gave.
+    """An image, and the start given by the user.
 
     Attributes:
-        view: of the image.
-        model: of a person; a subject's lengths replace the model's.
-        body: of the poses of a mixture.
-        camera: that sees the person.
+        view: view of the image.
+        model: body of an average person; a subject's lengths replace its own.
+        body: body for the poses of a given mixture.
+        camera: camera that sees the person.
         upright: gravity; None: unknown.
-        given: subject or mixture that the track starts from; None: the images start it.
+        given: subject or mixture from which the track starts; None: images start the track.
         box: (left, top, right, bottom) of the person, px; None: unknown.
     """
 
@@ -158,7 +158,7 @@ def _from_box(shown: Shown) -> Start:
 
 
 def _at_depth(shown: Shown, body: Body, mixture: GaussianMixture) -> Start:
-    """A start from a mixture over poses, moved to the depths of their trunks if measured."""
+    """Start from a mixture over poses, moved to the measured depths of the trunk, if any."""
     means = moved_to_depth(body, shown.camera, mixture.means, shown.depths)
     return Start(body, means, replace(mixture, means=means))
 
@@ -179,8 +179,8 @@ def _masked(shown: Shown) -> bool:
     return mask is not None and silhouette is not None and looks_like_person(silhouette)
 
 
-# Source; test of the required inputs; `sure`, the log odds of existence by the source itself, nats,
-# infinite for a given start; function that makes the start, or None if the image does not allow it.
+# Each row: the source; a test for its inputs; `sure`, its log odds of existence, nats, infinite for
+# a given start; a function that returns the start, or None if it is impossible.
 STARTS: tuple[
     tuple[Source, Callable[[Shown], bool], float, Callable[[Shown], Start | None]], ...
 ] = (
@@ -207,7 +207,7 @@ STARTS: tuple[
 
 
 def first_start(shown: Shown, existence: Existence) -> tuple[Source, Start] | None:
-    """The source and the start of a track at an image; None if no track starts."""
+    """Returns the source and the start of a track in an image; None if no track starts."""
     awaited = shown.given is not None and shown.box is None
     usable = (
         (source, sure, begin)
@@ -231,7 +231,7 @@ def first_start(shown: Shown, existence: Existence) -> tuple[Source, Start] | No
 
 
 def lifted_poses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
-    """Poses (N, d) of a person from keypoints lifted by experts; none without experts."""
+    """Poses (N, d) of a person from keypoints lifted by experts; empty without experts."""
     lifted = keypoints.lifted
     if lifted is None or not lifted.are_whole:
         return np.empty((0, body.dimension))
@@ -247,10 +247,11 @@ def poses_to_search(
     prediction: PosePrediction | None,
     upright: Gravity | None,
 ) -> Array | None:
-    """Poses (N, d) of a person from an image alone; None if it gives none.
+    """Poses (N, d) of a person from one image alone, or None.
 
-    The body keeps its lengths and flesh. Keypoints give all poses that explain them; without them
-    a silhouette gives mean poses of several headings at its place. Predicted poses are added.
+    The lengths and flesh of the body are fixed. Keypoints give all poses that explain them. Without
+    keypoints, a silhouette gives mean poses at several headings, at its place. Predicted poses are
+    added.
     """
     found = []
     keypoints, depths = observation.keypoints, observation.evidence.get(DEPTH.name)
@@ -267,9 +268,9 @@ def poses_to_search(
 
 
 def with_reversals(body: Body, poses: Array) -> Array:
-    """Poses (N, d), best first, and the reversals in depth of the best.
+    """Poses (N, d), best first, followed by the depth reversals of the best.
 
-    A reversal explains the same keypoints if the detector has exchanged left and right.
+    A reversed pose explains the same keypoints if the detector has exchanged left and right.
     """
     if not body.trunk_pairs:
         return poses

@@ -1,15 +1,15 @@
 """Motion of the camera between images, in a fixed frame.
 
-    p' = R p + t                     of a fixed point, in the camera frames of two images, m
-    R = C'^T C,  t = C'^T (c - c')   with poses of the camera p_fixed = C p + c
+    p' = R p + t                     a fixed point in the camera frames of two images, m
+    R = C'^T C,  t = C'^T (c - c')   from poses of the camera, p_fixed = C p + c
 
-A mixture over poses is in the camera frame. Before prediction it is transformed from the frame of
-the last image to that of the present one, so that velocities and predictions are those of the
-person in the fixed frame. With the rotation vectors of the root's angles, w = A(a) da/dt,
+A mixture over poses is in the camera frame. Before prediction it is transformed from the camera
+frame of the last image to that of the present image, so that velocities and predictions are
+relative to the fixed frame. With the angular velocity w = A(a) da/dt of the root's angles a,
 
     place' = R place + t,   Q(a') = R Q(a),   da' = A(a')^-1 R A(a) da
 
-and means of velocities and covariances of states follow with this Jacobian.
+and the mean velocities and the covariances of states are transformed with this Jacobian.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class CameraMotion:
     """Transform from the camera frame of one image to that of another: p' = R p + t.
 
     Attributes:
-        rotation: R (3, 3).
-        translation: t (3,), m.
+        rotation: rotation R (3, 3).
+        translation: translation t (3,), m.
     """
 
     rotation: Array
@@ -43,7 +43,7 @@ class CameraMotion:
 
     @classmethod
     def between(cls, before: CameraPose, now: CameraPose) -> CameraMotion | None:
-        """The motion from one pose of the camera to another; None if they are the same."""
+        """Motion from one pose of the camera to another; None if the poses are equal."""
         if before.equals(now):
             return None
         back = now.rotation.T
@@ -59,20 +59,20 @@ class CameraMotion:
         return result
 
     def poses(self, body: Body, poses: Array) -> Array:
-        """Poses (N, d) of a body in the new camera frame, within its limits."""
+        """Transforms poses (N, d) of a body, and clips them to its limits."""
         return np.clip(self.free_poses(body, poses), body.lower, body.upper)
 
     def free_poses(
         self, body: Body, poses: Array, turn: float = 0.0, to: Body | None = None
     ) -> Array:
-        """Poses (N, d) of a body in the new frame, without regard to its limits.
+        """Transforms poses (N, d) of a body, without regard to its limits.
 
         Args:
-            body: of the poses.
-            poses: (N, d).
-            turn: angle about z by which the root has turned, rad, to choose the whole turns where
-                several motions are chained.
-            to: the same body with the level of the result; None: the level is unchanged.
+            body: body of the poses.
+            poses: (N, d) poses.
+            turn: approximate rotation of the root about z, rad, which selects the whole turns of
+                the result in a chain of motions.
+            to: body with the level of the result; None: the level is unchanged.
         """
         offset = body.skeleton.offsets[0]
         result = turned(body, poses, body if to is None else to, self.rotation, turn)
@@ -80,13 +80,13 @@ class CameraMotion:
         return result
 
     def jacobians(self, body: Body, before: Array, after: Array, to: Body | None = None) -> Array:
-        """Derivatives (N, d, d) of `free_poses` at poses (N, d), whose results are `after`."""
+        """Derivatives (N, d, d) of `free_poses` at poses `before`, with the results `after`."""
         result = turn_jacobians(body, before, body if to is None else to, after, self.rotation)
         result[:, :3, :3] = self.rotation
         return result
 
     def modes(self, body: Body, modes: Modes) -> Modes:
-        """Modes in the new camera frame."""
+        """Transforms modes to the new camera frame."""
         poses = self.poses(body, modes.poses)
         jacobians = self.jacobians(body, modes.poses, poses)
         joints = body.joint_positions(poses)
@@ -109,11 +109,11 @@ class CameraMotion:
 
 
 class CameraPath:
-    """The poses of the camera at the images, given for most of them.
+    """Poses of the camera at the images, given for most images.
 
-    For an image without a pose, the motion between the last two given poses is extrapolated, for at
-    most `MAX_EXTRAPOLATION_TIME`; after that it is unknown until the next pose is given. A later
-    pose replaces the extrapolation: the pose at the previous image is then interpolated.
+    For an image without a pose, the motion between the last two given poses is extrapolated for at
+    most `MAX_EXTRAPOLATION_TIME`; after that the motion is unknown until the next given pose. A
+    given pose corrects the extrapolation: the pose at the previous image is then interpolated.
 
     Attributes:
         known: whether the motion to the present image is given or extrapolated.
@@ -125,11 +125,11 @@ class CameraPath:
         self._last_stamp = 0
 
     def advance(self, stamp: int, pose: CameraPose | None) -> CameraMotion | None:
-        """The motion from the last image to the next one; None if none or unknown.
+        """Advances to the next image; returns the motion since the last, None if zero or unknown.
 
         Args:
-            stamp: of the image, ns.
-            pose: of the camera; None: not given.
+            stamp: timestamp of the image, ns.
+            pose: pose of the camera; None: not given.
         """
         last, self._last_stamp = self._last_stamp, stamp
         if pose is not None:
@@ -151,7 +151,7 @@ class CameraPath:
 def _pose_at(
     first: tuple[int, CameraPose], second: tuple[int, CameraPose], stamp: int
 ) -> CameraPose:
-    """The pose at a stamp, by the constant motion between two poses with stamps, ns."""
+    """Interpolates or extrapolates two poses with timestamps, ns, to another timestamp."""
     (start, a), (end, b) = first, second
     if stamp == end or a.equals(b):
         return b

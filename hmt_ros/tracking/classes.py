@@ -1,24 +1,25 @@
-"""Classes of a hypothesis that are Markov chains: facing direction, and sides of the detector.
+"""Markov chains of each hypothesis: facing direction, and sides exchanged by the detector.
 
-Facing direction of the person: a two-state chain, whose evidence lasts as long as the track.
+Facing direction of the person: a two-state chain, which uses all images of the track.
 
     S_t- = max(logit [exp(Q dt)] p_(t-1), max min(log t(x_k, x_j), log h(x_k, x_j))),
-                                                                   j as the track faces, k not  (1)
+                                                                   j faces as the track, k not  (1)
     S_t  = S_t- + b(min e_k (as the track faces) - min e_k (the other way))                     (2)
     b(d) = log (v e^d + 1 - v) - log (v + (1 - v) e^d)                                          (3)
 
 A camera hardly distinguishes a pose from its reversal in depth (`body.mirror`), and small steps do
 not correct a wrong one. S = logit p are the log odds that the person faces the other way than the
-heaviest mode, Q the rate of the symmetry `reversal` (`body.body`), e_k the energy of an image at
+heaviest mode, Q the rates of the symmetry `reversal` (`body.body`), e_k the energy of an image at
 mode k. Nobody turns round from one image to the next: a hypothesis that faces the other way is
-another history of the track, weighed with the evidence of all images so far for that history,
+another history of the track. It is weighed with the evidence of all images so far for that history,
 even if none of its modes was kept. In a side view the two histories join (1): t is the transition
-density of the joints (`weighting`), h that of the heading, which diffuses at the rate of the body.
-The best motion of either way represents it (2), because neither the number of its modes nor a
-motion that was not followed is evidence. An image shows the facing direction with the probability
-v, else something unrelated, like a flash or a covered lens (3): no single image reverses a track.
-A mode stores the log odds of its own way: -S, or S if it faces the other way than the heaviest. In
-the ancestry of the modes the transition between poses that face different ways is
+density of the joints (`weighting`), h the transition density of the heading, which diffuses at the
+rate of the body. The best mode represents its facing direction (2), because neither the number of
+modes nor a jumped mode is evidence for it. An image shows the facing direction with the probability
+v, otherwise something unrelated, such as a flash or a covered lens (3): no single image reverses a
+track. A mode stores the log odds of its own facing direction: -S, or S if it faces the other way
+than the heaviest. For the ancestry of the modes, the transition density between poses of opposite
+facing directions is
 
     log t(x_k, x_j) = log (exp min(log t, log h) + [exp(Q dt)]_ww')                             (6)
 
@@ -27,9 +28,9 @@ Exchange of left and right by the detector, in each mode from image to image:
     p(e_t | m) = sum_e' p(e_t | e') p(e' | ancestor of m),     p(e_t | e') = [exp(Q dt)]_e'e    (4)
     p(e_t | m, keypoints) ~ p(e_t | m) exp(-E_e(x_m))                                           (5)
 
-Q are the rates at which detectors start and stop to exchange sides (`image.keypoint_schemes`). A
-reversed pose with exchanged sides explains the same keypoints as the pose itself: the two differ in
-that people turn slowly, while detectors exchange sides at once.
+Q are the rates at which detectors start and stop exchanging sides (`image.keypoint_schemes`). A
+reversed pose with exchanged sides explains the same keypoints as the pose itself. The only
+difference is that people turn slowly, while detectors exchange sides at once.
 """
 
 from __future__ import annotations
@@ -59,16 +60,17 @@ EXCHANGES = MarkovChain(exchange_rates())
 
 
 class Ways(NamedTuple):
-    """Inputs of the core for weighing hypotheses of both facing directions.
+    """Inputs for the compiled function that weighs hypotheses of both facing directions.
 
     Attributes:
-        before: (K,) modes that face the other way than the heaviest.
-        back: (N,) hypotheses that face the other way than the heaviest mode.
-        variance: of the turn since the previous image, rad^2.
-        log_odds: of the other way, predicted by the chain.
-        price: -log of the probability that the way has changed since, nats.
-        valid: share of the images that show the facing direction.
-        most: bound on the log odds.
+        before: (K,) whether each mode faces opposite to the heaviest.
+        back: (N,) whether each hypothesis faces opposite to the heaviest mode.
+        variance: variance of the turn since the previous image, rad^2.
+        log_odds: log odds of the other facing direction, predicted by the chain.
+        price: -log of the probability of a change of facing direction since the previous image,
+            nats.
+        valid: probability v that an image shows the facing direction.
+        most: bound on the size of the log odds.
     """
 
     before: Mask
@@ -81,7 +83,7 @@ class Ways(NamedTuple):
 
 
 def ways(body: Body, joints: Array, reference: Array) -> Mask:
-    """Whether poses with joints (N, J, 3) face the other way than one with joints (J, 3).
+    """Whether poses, joints (N, J, 3), face the other way than a reference, joints (J, 3).
 
     All False for a body without a trunk.
     """
@@ -91,7 +93,7 @@ def ways(body: Body, joints: Array, reference: Array) -> Mask:
 
 
 def first_facing(body: Body, joints: Array, log_weights: Array) -> Array:
-    """Log odds (N,) of the facing direction of each pose at the start of a track."""
+    """Log odds (N,) of each pose's facing direction at the start of a track."""
     back = ways(body, joints, joints[np.argmax(log_weights)])
     log_odds = -MAX_FACING_NATS
     if back.any():
@@ -100,25 +102,26 @@ def first_facing(body: Body, joints: Array, log_weights: Array) -> Array:
 
 
 def lost_a_facing(back: Mask, log_weights: Array) -> bool:
-    """Whether no mode of comparable weight faces one of the two ways.
+    """Whether one of the two facing directions has no mode of comparable weight.
 
     Args:
-        back: (K,) modes that face the other way than the heaviest.
-        log_weights: (K,) of the modes in the image.
+        back: (K,) whether each mode faces opposite to the heaviest.
+        log_weights: (K,) log weights of the modes in the image.
     """
     one_way = not back.any() or back.all()
     return bool(one_way or log_weights[back].max() > log_weights[~back].max() + MAX_FACING_NATS)
 
 
 def best_of_the_other_way(body: Body, joints: Array, log_weights: Array, least: float) -> list[int]:
-    """Index of the heaviest of N poses that faces the other way than the heaviest, if any.
+    """Index of the heaviest pose that faces opposite to the overall heaviest, if any.
 
-    It is kept as long as its way has any weight, because small steps do not find it again.
+    The pose is kept while its facing direction has any weight, because small steps would not find
+    it again.
 
     Args:
-        body: of the poses.
-        joints, log_weights: (N, J, 3), (N,).
-        least: log weight relative to the heaviest below which the weight counts as 0.
+        body: body of the poses.
+        joints, log_weights: joints (N, J, 3) and log weights (N,) of the poses.
+        least: log weight relative to the heaviest below which a weight counts as 0.
     """
     best = int(np.argmax(log_weights))
     back = np.flatnonzero(ways(body, joints, joints[best]))
@@ -135,19 +138,19 @@ def weigh_ways(
     evidence: Array,
     followed: Mask,
 ) -> tuple[Array, Array, Array]:
-    """Log weights (N,) of poses, where each facing direction has the weight of its history.
+    """Log weights (N,) of poses such that each facing direction has its history's weight.
 
     Args:
-        modes: of the previous image, K.
-        continuity: of the image, with the predicted poses of the modes.
-        joints: (N, J, 3) of the poses, m.
-        transitions: (K, N) log t(x_n, x_k) from the modes.
-        log_weights: (N,); only their ratios within a way are used.
-        evidence: (N,) energies of the image, nats.
-        followed: (N,) whether each did not jump with all degrees of freedom.
+        modes: K modes of the previous image.
+        continuity: transition densities to the image, with the predicted poses of the modes.
+        joints: (N, J, 3) joints of the poses, m.
+        transitions: (K, N) log transition densities t(x_n, x_k) from the modes.
+        log_weights: (N,) log weights, of which only ratios within a facing direction are used.
+        evidence: (N,) energies of the image at the poses, nats.
+        followed: (N,) False for poses that jumped in all degrees of freedom.
 
     Returns:
-        The log weights, the log odds (N,) of the facing direction of each, and the term (K, N) that
+        The log weights, the log odds (N,) of each pose's facing direction, and the term (K, N) that
         (6) adds to log t.
     """
     body, dt = continuity.body, continuity.dt
@@ -159,7 +162,7 @@ def weigh_ways(
     of_ways = Ways(
         modes.back,
         ways(body, joints, body.joint_positions(modes.poses[:1])[0]),
-        # The heading diffuses like the rotation of the pelvis about the vertical.
+        # The heading diffuses at the rate of the pelvis's rotation about the vertical.
         float(body.rates[root_rotation_dofs(body.skeleton)[0]]) * dt,
         reversal.after(log_odds, dt),
         reversal.price(dt),
@@ -178,26 +181,26 @@ def weigh_ways(
 
 
 def predicted_exchanges(exchanges: Array, dt: float) -> Array:
-    """Log probabilities (K, E) of exchanges of sides a time dt, s, later, (4)."""
+    """Log probabilities (K, E) of exchanged sides dt seconds later, (4)."""
     p = EXCHANGES.predict(elementary.exp(exchanges), dt)
     return np.asarray(elementary.log(np.maximum(p, LEAST_EXCHANGE)), dtype=np.float64)
 
 
 def known_exchanges(exchanges: Array) -> Array:
-    """Log probabilities (N, E) of exchanges of sides, with the usual ones where unknown."""
+    """Replaces unknown log probabilities (N, E) of exchanged sides with the usual ones."""
     return np.where(np.isnan(exchanges), usual_exchanges(), exchanges)
 
 
 def seen_exchanges(
     likelihood: ImageLikelihood, observation: Observation, poses: Array, exchanges: Array
 ) -> Array:
-    """Log probabilities (K, E) of exchanges of sides after an image, (5).
+    """Log probabilities (K, E) of exchanged sides given an image, (5).
 
     Args:
-        likelihood: of the body.
-        observation: of the image; without keypoints nothing changes.
-        poses: (K, d) modes.
-        exchanges: (K, E) of the modes, before the image.
+        likelihood: likelihood of the body.
+        observation: observation of the image; without keypoints, `exchanges` is returned.
+        poses: (K, d) poses of the modes.
+        exchanges: (K, E) log probabilities of exchanged sides, before the image.
     """
     if observation.keypoints is None or likelihood.settings.keypoints.weight == 0:
         return exchanges

@@ -1,34 +1,34 @@
-"""The probability that a person is in view; every image may also show nobody.
+"""Existence: the probability that a person is in view.
 
     r = p(somebody is in view | images so far)
 
     predict   r <- s(dt) r + b(dt) (1 - r)                     a chain of two states (`MarkovChain`)
     update    logit r <- logit r + sum_g a_g(dt) llr_g         a_g(dt) = tanh(dt / (2 tau_g))
 
-This is the existence of integrated probabilistic data association (Musicki, Evans and Stankovic,
-"Integrated probabilistic data association", 1994) and of the Bernoulli filter (Ristic et al., "A
-tutorial on Bernoulli filters", 2013, equations 28 and 56), with rates per second in place of
-probabilities per scan. llr_g is the log likelihood ratio of the whole image for somebody against
-nobody by cue g, and a_g its remaining share, because its errors persist (`error_model`).
+This is the existence probability of integrated probabilistic data association (Musicki, Evans and
+Stankovic, "Integrated probabilistic data association", 1994) and of the Bernoulli filter (Ristic et
+al., "A tutorial on Bernoulli filters", 2013, equations 28 and 56), with rates per second in place
+of probabilities per scan. llr_g is the log likelihood ratio of somebody against nobody for cue g in
+the whole image, and a_g its remaining share, because its errors persist (`error_model`).
 
     silhouette   m = max(share of the model on it / usual share, area of its largest piece that has
                  the shape of a person / usual area), in the whole image
     detector     sum of the confidences of the keypoints
-    predictor    whether it predicts a person; a yes counts only if there is no silhouette
+    predictor    whether it predicts a person; if so, used only without a silhouette
     motion       whether the model moved, and nothing else; only if there is no other cue
     colours      whether the person's colours are anywhere; only if nothing else shows a person, and
                  against a person only in the scene where they were learned
 
-Before a track, keypoints count once per picture: a detector that confuses the foot of a table with
-a person does so in every image that shows the same. People move, if only a little.
+Before a track, keypoints of unchanged images count once: a detector that confuses the foot of a
+table with a person does so in every such image. People always move a little.
 
-If nothing at all has moved, a person who was in view still is, so the prediction is skipped.
+If nothing has moved, a person who was in view still is, so the prediction is skipped.
 
-An image that has mostly changed is no evidence: a covered lens, a flash, noise. The colours of a
-track are no evidence against a person when the camera has moved: they may have been those of an
-object. For a person hidden by others, only evidence for the person counts. So only an image of the
-empty place ends a track: without it r tends to b / (b + l), which is far above
-`ABSENT_PROBABILITY`.
+An image that has mostly changed is no evidence: a covered lens, a flash, noise. If the camera has
+moved, missing colours are no evidence against a person: they may have been those of an object. If
+others hide the person, only evidence for the person counts. So only an image of the empty place
+ends a track: without such an image r tends to b / (b + l), far above `ABSENT_PROBABILITY`, with the
+rates b of entering and l of leaving the view.
 """
 
 from __future__ import annotations
@@ -66,10 +66,10 @@ NO_MOTION = Motion(moved=False, still=False)
 class Status(Enum):
     """State of the tracker."""
 
-    WAITING = 'waiting'  # for the subject's image, or for somebody
+    WAITING = 'waiting'  # waits for the subject's image, or for a person
     TRACKING = 'tracking'
     LOST = 'lost'
-    NOBODY = 'nobody'  # is in view
+    NOBODY = 'nobody'  # nobody is in view
 
 
 class Cue(NamedTuple):
@@ -77,7 +77,7 @@ class Cue(NamedTuple):
 
     Attributes:
         nats: largest log likelihood ratio of somebody against nobody.
-        tau: duration of its errors, s.
+        tau: correlation time of the errors of the cue, s.
     """
 
     nats: float
@@ -86,24 +86,24 @@ class Cue(NamedTuple):
 
 CLEAR, DOUBTFUL = (Cue(*EXISTENCE_CUES[name]) for name in ('clear', 'doubtful'))
 
-# Probability before the first image, as after one clear image of nobody, and that of a given start,
-# as after one clear image of a person.
+# Probability of existence before the first image, as after one clear image of nobody, and at a
+# given start, as after one clear image of a person.
 NOBODY_YET, GIVEN = of_log_odds([-CLEAR.nats, CLEAR.nats])[:, 1].tolist()
 
 
 class Sighting(NamedTuple):
-    """Evidence of an image for a person, by all cues.
+    """Evidence of all cues in an image for or against a person.
 
     Attributes:
-        said: log likelihood ratios by cue, nats; positive: a person is in view.
-        seen: whether the image shows a person to track: a cue shows a person, or the image is
-            usable and no cue speaks against a person.
-        blank: whether the image gives nothing to fit modes to: others hide most of the person, or
-            the silhouette shows nobody.
-        hidden: whether others hide most of the person.
-        elsewhere: whether the image shows a person away from all modes, or after so long that the
-            modes are useless: the track has to search.
-        there: whether the image shows the person, or equals an image that did.
+        said: log likelihood ratio of each cue, nats; positive for a person in view.
+        seen: whether the person can be tracked in the image: a cue shows a person, or the image is
+            usable and no cue is evidence against a person.
+        blank: whether modes cannot be fitted to the image, because others hide most of the person,
+            or the silhouette shows nobody.
+        hidden: whether other people hide most of the person.
+        elsewhere: whether the track must search, because the image shows a person away from all
+            modes, or after so long a time that the modes are useless.
+        there: whether the image shows the person, or is unchanged since an image that did.
     """
 
     said: Mapping[str, float] = MappingProxyType({})
@@ -115,20 +115,20 @@ class Sighting(NamedTuple):
 
     @property
     def llr(self) -> float:
-        """Sum over the cues, nats; positive: a person is in view."""
+        """Log likelihood ratio of all cues, nats; positive for a person in view."""
         return sum(self.said.values())
 
 
 class Existence:
-    """The probability that a person is in view, image by image.
+    """Filter of the probability that a person is in view.
 
     Args:
-        probability: before the first image.
+        probability: probability before the first image.
 
     Attributes:
-        last: evidence of the last image.
-        told: stamp of the last evidence of each cue, ns.
-        appearance: of the person.
+        last: evidence from the last image.
+        told: timestamp of the last evidence of each cue, ns.
+        appearance: appearance of the person.
     """
 
     def __init__(self, probability: float = NOBODY_YET) -> None:
@@ -136,46 +136,46 @@ class Existence:
         self.last = Sighting()
         self.told: dict[str, int] = {}
         self.appearance = Appearance()
-        self._stamps: tuple[int, int] | None = None  # of the first and of the last image
+        self._stamps: tuple[int, int] | None = None  # first and last image, ns
         self._still = StillPicture()
 
     @property
     def probability(self) -> float:
-        """R, given all images so far."""
+        """Probability that a person is in view, given all images so far."""
         return float(self._p[1])
 
     @property
     def log_odds(self) -> float:
-        """Of somebody in view, nats."""
+        """Log odds of a person in view, nats."""
         nobody, somebody = elementary.log(np.maximum(self._p, 1e-300))
         return float(somebody - nobody)
 
     @property
     def somebody(self) -> bool:
-        """Whether a person is there."""
+        """Whether a person is in view."""
         return self.probability >= PRESENT_PROBABILITY
 
     @property
     def nobody(self) -> bool:
-        """Whether nobody is there, and the last image has said so."""
+        """Whether nobody is in view, and the last image was evidence of that."""
         return self.probability < ABSENT_PROBABILITY and self.last.llr < 0.0
 
     def look(self, view: View, body: Body, *, waiting: bool = False) -> None:
-        """Updates the probability by the next image.
+        """Updates the probability from the next image.
 
         Args:
-            view: of the image, later than the previous one.
-            body: of the person.
+            view: view of the image, later than the previous one.
+            body: body of the person.
             waiting: whether no track has started yet.
         """
         stamp = view.stamp
-        # Motion is a cue only if there is no other.
+        # Motion is used only without another cue.
         alone = view.anywhere is None and view.keypoints is None and not waiting
         motion = self.appearance.motion(view) if alone else NO_MOTION
         still = motion.still and self.last.there
         if self._stamps is not None and not still:
             self._p = CHAIN.predict(self._p, seconds(stamp - self._stamps[1]))
-        # After a long time unseen, the person may have left.
+        # A person who has not been seen for long may have left.
         forgotten = bool(CHAIN.closed(1.0, self.appearance.unseen(stamp)) < MAJORITY)
         hidden = self.appearance.open_to_view(view.others) < 1.0 - MAJORITY
         cues, usable, apart = self._cues(view, body)
@@ -208,11 +208,11 @@ class Existence:
         self._stamps = stamp if self._stamps is None else self._stamps[0], stamp
 
     def _cues(self, view: View, body: Body) -> tuple[dict[str, tuple[float, Cue]], bool, bool]:
-        """Values of the cues by name, from -1, nobody, to 1, and two facts about the image.
+        """Evaluates the cues: -1 is nobody, 1 is a person.
 
         Returns:
-            The cues that are evidence; whether a silhouette, if there is one, is usable; whether a
-            person is shown away from the model.
+            Value and weight of each informative cue; whether the image is usable, which it is
+            without silhouettes too; whether it shows a person away from the model.
         """
         cues, apart = {}, False
         usable = view.anywhere is None
@@ -242,7 +242,7 @@ class Existence:
         return cues, usable, apart
 
     def _time_since(self, cue: str, stamp: int) -> float:
-        """Time since the last evidence of a cue, s; infinite in the first image."""
+        """Time since the last evidence from a cue, s; infinite in the first image."""
         if self._stamps is None:
             return math.inf
         return seconds(stamp - self.told.get(cue, self._stamps[0]))

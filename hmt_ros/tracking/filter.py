@@ -1,7 +1,7 @@
 """Mixture density propagation: the five steps from image to image (KJS figure 4).
 
 predict     x_k | ancestor       motion prior, optical flow                       prediction
-propose     x_k^0                jumps, samples, predictions of others            proposals
+propose     x_k^0                jumps, samples, external predictions             proposals
 optimise    x_k = argmin E(x)    bounded Newton from x_k^0                        optimisation
 weigh       log w_k = log sum_j w_j p(x_k | x_j) - sum_g a_g E_g(x_k)             weighting
 select      K of N hypotheses    least expected distance to the nearest kept one  selection
@@ -69,8 +69,8 @@ class Judged(NamedTuple):
     """Misfits of the modes to the cues of an image.
 
     Attributes:
-        misfits: by cue, and of the outline of the silhouette.
-        alone: the pose by keypoints alone; None: not needed.
+        misfits: misfits by name of the cue, and that of the silhouette's outline.
+        alone: pose fitted to keypoints alone; None: not needed.
     """
 
     misfits: dict[str, Misfit]
@@ -78,22 +78,22 @@ class Judged(NamedTuple):
 
 
 class MixtureFilter:
-    """The posterior over the poses of one person, a mixture that is updated image by image.
+    """Posterior over the poses of one person: a mixture, updated image by image.
 
     Args:
-        body: of the person.
-        camera: that sees the person.
-        settings: of the tracker.
-        seed: of all randomness.
+        body: body of the person.
+        camera: camera that sees the person.
+        settings: settings of the tracker.
+        seed: random seed.
         extra: further energy terms.
         ground: gravity and floor; None: not used.
 
     Attributes:
-        body: with the estimated lengths and flesh.
+        body: body with the estimated lengths and flesh.
         dynamics: motion prior of the modes.
         modes: present modes, heaviest first; empty before the start.
         published: the modes, with unseen limbs spread over usual postures.
-        shape: the estimate of lengths and flesh.
+        shape: estimate of lengths and flesh.
         limbs: visibility of the limbs in the images.
         misfit: share of the last image that no mode explains.
         spent: numbers of evaluations of the likelihood in the last image.
@@ -129,7 +129,7 @@ class MixtureFilter:
 
     @property
     def person(self) -> Body:
-        """The body, with a larger error of joints that no image shows."""
+        """Body with larger standard deviations of the joints of unseen limbs."""
         return self.limbs.told(self.body)
 
     # The start.
@@ -165,7 +165,7 @@ class MixtureFilter:
         return self._judge(observation)
 
     def begin_anew(self, poses: Array, observation: Observation) -> Judged:
-        """Restarts at an image, from the present modes and from poses (N, d)."""
+        """Restarts the track in an image, from the present modes and from poses (N, d)."""
         self.spent.clear()
         poses = np.concatenate([self.modes.poses, poses])
         term = self.posterior.of_image(observation)
@@ -203,7 +203,7 @@ class MixtureFilter:
         """Propagates the mixture to the next image.
 
         Args:
-            observation: of the image.
+            observation: observation of the image.
             dt: time since the previous image, s.
             prediction: pose hypotheses from an external predictor, if any.
         """
@@ -244,10 +244,10 @@ class MixtureFilter:
     def _weigh(
         self, search: Search, optimised: Optimised
     ) -> tuple[Optimised, Array, Array, Array, Array]:
-        """The first five arguments of `_select`: distinct hypotheses and their weights."""
+        """Weighs distinct hypotheses; returns the first five arguments of `_select`."""
         optimised = _finite(optimised)
         evidence = search.evidence(optimised)
-        # Of equal hypotheses, those that moved there precede those that jumped.
+        # Of equal hypotheses, those without a jump precede those that jumped.
         followed = np.asarray(~optimised.hypotheses.jumped.any(1))
         order = np.lexsort((evidence, ~followed))
         joints = self.body.joint_positions(optimised.minima.x)
@@ -282,13 +282,12 @@ class MixtureFilter:
 
         Args:
             optimised: N distinct hypotheses at their optima.
-            joints: (N, J, 3) of these, m.
-            log_weights: (N,).
-            facing: (N,) log odds of the facing direction of each.
-            histories: (K, N) log w_k p(x_n | x_k) of the K previous modes, for the ancestry; K is 0
-                at a start.
-            observation: of the image.
-            search: that found the hypotheses; None: the track starts.
+            joints: (N, J, 3) joints of the hypotheses, m.
+            log_weights: (N,) log weights.
+            facing: (N,) log odds of the facing direction of each hypothesis.
+            histories: (K, N) log w_k p(x_n | x_k) from the K previous modes; K is 0 at a start.
+            observation: observation of the image.
+            search: search that found the hypotheses; None: the track starts.
         """
         s, posterior, poses = self.settings, self.posterior, optimised.minima.x
         before = None if search is None else search.modes
@@ -338,7 +337,7 @@ class MixtureFilter:
             self._points = seen_points(posterior.body, self.camera, frames, observation.others)
 
     def _publish(self, modes: Modes) -> None:
-        """Sets the published modes, and their origins among those of the previous image."""
+        """Sets the published modes, and their origins in the previous image."""
         before, self._sources = self._sources, np.arange(len(modes))
         weights = elementary.exp(self.published.log_weights)
         unseen = self.limbs.of_dofs(self.body)
@@ -359,11 +358,11 @@ class MixtureFilter:
     # Learning.
 
     def _judge(self, observation: Observation, search: Search | None = None) -> Judged:
-        """Misfits of the modes to an image.
+        """Computes the misfits of the modes to an image.
 
         Args:
-            observation: of the image.
-            search: that found the modes; None: the track starts.
+            observation: observation of the image.
+            search: search that found the modes; None: the track starts.
         """
         modes, s, alone = self.modes, self.settings.likelihood, None
         found = of_silhouette(
@@ -387,7 +386,7 @@ class MixtureFilter:
         return Judged(found, alone)
 
     def _fit_shape(self, observation: Observation, trust: float) -> bool:
-        """Updates the shape by an image; returns False if it has no evidence for it."""
+        """Updates the shape from an image; returns False if the image has no evidence of it."""
         if not self.settings.estimate_shape:
             return False
         if observation.outline is None and observation.keypoints is None:
@@ -410,7 +409,7 @@ class MixtureFilter:
         return True
 
     def _use_body(self, body: Body) -> None:
-        """Replaces the body by one with the same degrees of freedom."""
+        """Replaces the body by another one with the same degrees of freedom."""
         self.body = body
         self.dynamics = dynamics_of(body, self.settings.motion)
         self.posterior = Posterior(
@@ -419,7 +418,7 @@ class MixtureFilter:
 
 
 def _finite(optimised: Optimised) -> Optimised:
-    """Hypotheses of finite energy.
+    """Returns the hypotheses with a finite energy.
 
     Raises:
         ValueError: no hypothesis has a finite energy.

@@ -3,12 +3,12 @@
     h(p) = n . p + d        height of a point p over the floor, camera frame, m
 
 with n the unit vector against gravity and d the height of the camera. Unknown values are estimated
-from the track; see `GroundEstimator`. Given values are measurements: others refine them within
-their error,
+from the track; see `GroundEstimator`. Given values are measurements: other measurements refine them
+within their error,
 
     p(n | v) ~ N(n; n_0, s_0^2) [p N(v; n, s^2) + 1 - p],     v the vertical of the lines
 
-and may contradict them, but never replace them.
+and can contradict them, but never replace them.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class KnownGround:
         up_sigma: standard deviation of the direction about each horizontal axis, rad.
 
     Raises:
-        ValueError: a direction that is no unit vector, or a height that is not positive.
+        ValueError: the direction is not a unit vector, or the height is not positive.
     """
 
     up: Array | None = None
@@ -89,12 +89,12 @@ class KnownGround:
 class Ground(FloorPlane):
     """The present estimate of the ground, at the camera or at the person.
 
-    The standard deviation of an unknown height is inf.
+    An unknown height has an infinite standard deviation.
     """
 
     @property
     def plane(self) -> Array | None:
-        """(4,) n and d with n . x + d = 0 on the floor; None if the height is unknown."""
+        """Plane (4,) of the floor: n and d with n . x + d = 0; None if the height is unknown."""
         return None if self.height is None else np.append(self.up, self.height)
 
 
@@ -102,7 +102,7 @@ def unit_vector(up: ArrayLike) -> Array:
     """Checks a direction (3,) and normalises it.
 
     Raises:
-        ValueError: another shape, or a length that differs from 1 by 1 % or more.
+        ValueError: the shape is not (3,), or the length differs from 1 by 1 % or more.
     """
     vector = np.array(up, dtype=np.float64)
     size = length(vector) if vector.shape == IMAGE_UP.shape else np.nan
@@ -119,17 +119,17 @@ class GroundEstimator:
     """Estimates the ground from prior knowledge, from the scene and from a track.
 
     The floor is a high quantile of the distance of the lowest sole below the camera in the last
-    seconds: people mostly stand on the floor, and sometimes jump. The lines of the scene
-    (`image.vertical_lines`) refine a given vertical. If none is given, the vertical is that of the
-    lines; without lines it is near the vertical of the image, and near the axis of a standing body,
-    from the middle of the feet to the centre of mass. Errors of that axis persist, so its images
-    count as one per `VERTICAL_TIME`, and its standard deviation is at least `AXIS_SIGMA`.
+    seconds, because people mostly stand on the floor, and sometimes jump. The lines of the scene
+    (`image.vertical_lines`) refine a given vertical. Without a given vertical, the lines determine
+    it. Without lines, it is estimated near the vertical of the image from the axis of a standing
+    body, which leads from the middle of the feet to the centre of mass. Errors of the axis persist,
+    so one image per `VERTICAL_TIME` counts, and the standard deviation is at least `AXIS_SIGMA`.
 
-    A given vertical is doubted if the lines show another one, or if it makes the person lie. It may
-    have the wrong sign, that of an accelerometer at rest. Its opposite is used where keypoints show
-    the person head down: from the first image if it points down in the image, else after
-    `HEAD_DOWN_IMAGES` images. A jump of the vertical of the lines is accepted if the next look
-    confirms it.
+    A given vertical is doubted if the lines show another one, or if the person would be lying down.
+    It may have the wrong sign, as from an accelerometer at rest. Its opposite is used if keypoints
+    show the person head down: from the first image if the given vertical points down in the image,
+    otherwise after `HEAD_DOWN_IMAGES` images. If the vertical of the lines jumps, the next look at
+    the lines must confirm it.
 
     Args:
         known: prior knowledge of gravity and floor; None: unknown.
@@ -137,10 +137,10 @@ class GroundEstimator:
     Attributes:
         known: prior knowledge of gravity and floor.
         estimate: the present estimate at the camera.
-        still: whether the motion of the camera is known, so that things at rest have known places
-            in its frame; set by the tracker.
+        still: whether the motion of the camera is known, so that objects at rest have known places
+            in the camera frame; set by the tracker.
         plane: gravity and floor at the person, for the energy of poses.
-        turning: whether the last given direction of gravity shows that the camera turned.
+        turning: whether the last two given directions of gravity show that the camera turned.
     """
 
     def __init__(self, known: KnownGround | None = None) -> None:
@@ -190,7 +190,7 @@ class GroundEstimator:
     def set_gravity(
         self, up: ArrayLike, camera_height: float | None = None, up_sigma: float = GIVEN_UP_SIGMA
     ) -> None:
-        """Sets a newer direction (3,) against gravity, camera frame, and height of the camera."""
+        """Sets a new direction (3,) against gravity, camera frame, and height of the camera, m."""
         before, vector = self.known.up, unit_vector(up)
         self.turning = before is not None and length(vector - before) > TURN_NOISE
         height = self.known.camera_height if camera_height is None else camera_height
@@ -199,7 +199,7 @@ class GroundEstimator:
 
     @property
     def reversed(self) -> bool:
-        """Whether the opposite of the given vertical is used; see `GroundEstimator`."""
+        """Whether the given vertical is used with the opposite sign; see `GroundEstimator`."""
         up = self.known.up
         if up is None:
             return False
@@ -211,24 +211,24 @@ class GroundEstimator:
         given = self._given
         if given is None:
             return False
-        # Gravity is more often wrong for a camera that hangs or lies.
+        # The given gravity is more often wrong if the camera is mounted sideways or upside down.
         upright = _dot(given, IMAGE_UP) >= 0.5
         prior = -RIGHT_VERTICAL_NATS if upright else 1.0 - RIGHT_VERTICAL_NATS
         return prior + self._by_lines + self._by_person > 0.0
 
     @property
     def level(self) -> Array:
-        """(3, 3) from an upright camera's axes to the camera's; identity if that is unknown."""
+        """Rotation (3, 3) from an upright camera's axes to the camera's; identity if unknown."""
         return roll(self.estimate.up) if self.vertical_known else AXES.copy()
 
     @property
     def _given(self) -> Array | None:
-        """(3,) the given vertical, with its sign corrected; None if none is given."""
+        """The given vertical (3,) with its sign corrected; None if not given."""
         up = self.known.up
         return up if up is None or not self.reversed else -up
 
     def see(self, keypoints: Keypoints) -> None:
-        """Updates the sign of the given vertical by the trunk of a detected person."""
+        """Updates the sign of the given vertical from the trunk of a detected person."""
         if self.known.up is not None:
             trunk = keypoints.trunk
             size = max(length(trunk), np.finfo(np.float64).eps)
@@ -236,7 +236,7 @@ class GroundEstimator:
             self._conclude()
 
     def look(self, image: Image, camera: Camera, stamp: int) -> None:
-        """Updates the vertical by the lines of an image, once per `VERTICAL_TIME`; stamp in ns."""
+        """Updates the vertical from lines of an image, once per `VERTICAL_TIME`; stamp in ns."""
         if self._looked is not None and 0 <= seconds(stamp - self._looked) < VERTICAL_TIME:
             return
         self._looked, given = stamp, self._given
@@ -255,26 +255,26 @@ class GroundEstimator:
 
     @property
     def vertical_known(self) -> bool:
-        """Whether the vertical is given or shown by lines of the scene, not guessed."""
+        """Whether the vertical is given or shown by lines of the scene, rather than guessed."""
         return self.known.up is not None or self._seen is not None
 
     @property
     def vertical(self) -> Array | None:
-        """(3,) the given vertical, or that of the lines, camera frame; None if unknown."""
+        """Vertical (3,), given or from lines of the scene, camera frame; None if unknown."""
         return self.estimate.up if self.vertical_known else None
 
     def gravity(self, weight: float) -> Gravity | None:
-        """Gravity for a start, with a factor on its energy; None if unknown or not used."""
+        """Gravity for a start, with the weight of its energy; None if unknown or not used."""
         return Gravity(self.plane, weight) if self.vertical_known and weight > 0 else None
 
     def with_contacts(self, body: Body, modes: Modes, before: Modes | None, dt: float) -> Modes:
-        """Modes with their soles, and the probabilities that these rest (`body.foot_contact`).
+        """Modes with their sole points and contact probabilities (`body.foot_contact`).
 
         Args:
-            body: of the modes.
-            modes: of an image.
-            before: modes of the previous image, in the same camera frame, among which the
-                ancestors are; None: the track starts.
+            body: body of the modes.
+            modes: modes of an image.
+            before: modes of the previous image, in the same camera frame, which are the ancestors;
+                None: the track starts.
             dt: time since the previous image, s.
         """
         points = sole_points(body, modes.poses)
@@ -285,7 +285,7 @@ class GroundEstimator:
         return replace(modes, soles=points, contacts=found)
 
     def by_foot(self, modes: Modes) -> dict[str, float]:
-        """Probability that the heaviest mode rests on a foot, by 'left_foot' and 'right_foot'.
+        """Probability of the heaviest mode resting on each foot, 'left_foot' and 'right_foot'.
 
         Empty if there are no modes, if the ground terms are off, if the body has no feet, or while
         the motion of the camera is unknown.
@@ -296,12 +296,12 @@ class GroundEstimator:
         return {f'{side}_foot': float(p) for side, p in zip(FEET, best, strict=True)}
 
     def update(self, body: Body, modes: Modes, resting: float, dt: float) -> None:
-        """Updates vertical and floor by the modes of an image.
+        """Updates vertical and floor from the modes of an image.
 
         Args:
-            body: of the modes.
-            modes: of the posterior.
-            resting: probability that both feet rest.
+            body: body of the modes.
+            modes: modes of the posterior.
+            resting: probability that both feet rest on the floor.
             dt: time since the previous image, s.
         """
         feet, mass = soles(body), masses(body.skeleton)
@@ -329,7 +329,7 @@ class GroundEstimator:
         self._conclude()
 
     def _said_by_person(self, cosine: float, dt: float) -> float:
-        """Log odds against the given vertical, nats, by the cosine of a person's axis to it."""
+        """Log odds against the given vertical, nats, from its cosine with a person's axis."""
         stands = 2.0 * UPRIGHT_CONCENTRATION
         stands *= elementary.exp(UPRIGHT_CONCENTRATION * (cosine - 1.0))
         most = RIGHT_VERTICAL_NATS * (1.0 + max(-cosine, 0.0))
@@ -337,7 +337,7 @@ class GroundEstimator:
         return min(max(self._by_person + float(said), -RIGHT_VERTICAL_NATS), most)
 
     def _follow_axis(self, axis: Array, place: Array, resting: float, dt: float) -> None:
-        """Updates the vertical by the mean axis (3,) of the body at a place (3,)."""
+        """Updates the vertical from the mean axis (3,) of a body at a position (3,)."""
         size = length(axis)
         if dt <= 0 or resting <= 0 or size == 0:
             return
@@ -376,7 +376,7 @@ class GroundEstimator:
                 self.plane = replace(self.estimate, height_sigma=sigma)
 
     def _tracked_level(self) -> tuple[float | None, float]:
-        """Height of the camera over the soles of the last seconds, and its deviation, m."""
+        """Height of the camera above the recent soles, m, and its standard deviation, m."""
         if not self._levels:
             return None, np.inf
         levels = sorted(level for _, level in self._levels)
@@ -403,7 +403,7 @@ class Gravity:
     """Gravity at the start of a track, when the floor is unknown.
 
     Attributes:
-        plane: the direction against gravity and its deviation; the height is not used.
+        plane: direction against gravity and its standard deviation; the height is not used.
         weight: factor on the energy of the lean, more than 0.
     """
 
@@ -411,11 +411,11 @@ class Gravity:
     weight: float = 1.0
 
     def term(self, body: Body) -> GroundTerm:
-        """The energy of the lean of a body's pelvis and trunk."""
+        """Energy of the lean of a body's pelvis and trunk."""
         plane = replace(self.plane, height=None, height_sigma=np.inf)
         return GroundTerm(body, GroundSettings(self.weight, 0.0), plane)
 
     def turned(self, body: Body, poses: Array) -> Array:
-        """Turns poses (N, d), upright in the image, by the shortest rotation to the vertical."""
+        """Rotates poses (N, d), upright in the image, by the shortest rotation to the vertical."""
         turn = shortest_turn(product(body.level, IMAGE_UP), self.plane.up)
         return np.clip(turned(body, poses, body, turn), body.lower, body.upper)

@@ -1,9 +1,9 @@
-"""Pose hypotheses from one image to the next: the data that the five steps share.
+"""Pose hypotheses: the data that the five steps from image to image share.
 
     predict -> propose -> optimise -> weigh -> select
 
-A hypothesis is created with an ancestor, its jumped variables and an expected pose. Optimisation
-gives it a locally optimal pose, weighing a weight; a selected hypothesis is a mode, with
+A hypothesis starts with an ancestor, a set of jumped variables and an expected pose. Optimisation
+adds a locally optimal pose, and weighing adds a weight; a selected hypothesis becomes a mode, with
 covariances.
 """
 
@@ -35,13 +35,13 @@ class Hypotheses:
     """N weighted poses and their ancestry.
 
     Attributes:
-        poses: (N, d).
-        log_weights: (N,) of the ancestors; for modes, log posterior probabilities.
-        ancestors: (N,) row of the mode of the previous image that each continues.
+        poses: (N, d) poses.
+        log_weights: (N,) log weights of the ancestors; for modes, log posterior probabilities.
+        ancestors: (N,) row of the previous image's mode that each hypothesis continues.
         expected: (N, d) centres of the motion prior.
         jumped: (N, d) degrees of freedom that jumped instead of following the motion prior.
-        exchanges: (N, E) log probabilities that the detector exchanges sides, before the image; for
-            modes, after it. NaN: unknown.
+        exchanges: (N, E) log probabilities that the detector exchanges sides, given earlier images;
+            for modes, given this image too. NaN: unknown.
     """
 
     poses: Array
@@ -55,24 +55,24 @@ class Hypotheses:
         return len(self.poses)
 
     def __getitem__(self, rows: Index | slice) -> Self:
-        """The hypotheses of some rows."""
+        """Selects rows."""
         names = self.__dataclass_fields__
         return type(self)(**{name: getattr(self, name)[rows] for name in names})
 
     def proposed(
         self, rows: Index, poses: Array, jumped: Mask, expected: Array | None = None
     ) -> Hypotheses:
-        """Hypotheses at other poses (N, d).
+        """Derives hypotheses at other poses (N, d).
 
-        A hypothesis that jumps with all degrees of freedom assumes that the track was wrong, so its
-        probabilities of exchanged sides are unknown.
+        If all degrees of freedom of a hypothesis jump, the track is assumed wrong, so the
+        probabilities of exchanged sides become unknown.
 
         Args:
-            rows: (N,) of the hypotheses that they are derived from.
-            poses: (N, d).
+            rows: (N,) rows of the source hypotheses.
+            poses: (N, d) poses.
             jumped: (N, d) degrees of freedom that jump.
-            expected: (N, d) centres of the motion prior; None: the new values of jumped degrees of
-                freedom, else those of the source hypotheses.
+            expected: (N, d) centres of the motion prior; None: new values for jumped degrees of
+                freedom, values of the source hypotheses for the others.
         """
         if expected is None:
             expected = np.where(jumped, poses, self.expected[rows])
@@ -99,8 +99,8 @@ class Optimised:
     """Hypotheses at their optima.
 
     Attributes:
-        hypotheses: N; their poses are the starting points.
-        minima: N rows; Hessians are those of the Gaussian posterior.
+        hypotheses: N hypotheses, whose poses are the starting points.
+        minima: N optima, with Hessians of the Gaussian posterior.
     """
 
     hypotheses: Hypotheses
@@ -110,7 +110,7 @@ class Optimised:
         return Optimised(self.hypotheses[rows], self.minima[rows])
 
     def joined(self, other: Optimised) -> Optimised:
-        """These hypotheses followed by others."""
+        """Concatenates with other hypotheses."""
         return Optimised(
             joined([self.hypotheses, other.hypotheses]), self.minima.joined(other.minima)
         )
@@ -118,23 +118,23 @@ class Optimised:
 
 @dataclass(frozen=True, eq=False)
 class Modes(Hypotheses):
-    """Optimised, weighed and selected hypotheses: the mixture that is propagated.
+    """Optimised, weighed and selected hypotheses, which form the propagated mixture.
 
     Attributes:
-        velocities: (N, d) per second.
-        covariances: (N, d, d) of the posterior, given all images so far.
-        filtered: (N, d, d) covariances as if errors were independent from image to image.
-        log_likelihoods: (N,) of the image.
-        state_covariances: (N, n, n) of poses and velocities, which are propagated. For a random
-            walk they are `filtered`; with velocities each image counts with a share, because errors
-            persist.
-        identities: (N,) see `Identities`.
-        origins: (N, M) probability that each continues mode m of the previous image; M is 0 at a
+        velocities: (N, d) velocities of the variables, per second.
+        covariances: (N, d, d) covariances of the posterior, given all images so far.
+        filtered: (N, d, d) covariances for errors that are independent from image to image.
+        log_likelihoods: (N,) log likelihoods of the image.
+        state_covariances: (N, n, n) propagated covariances of poses and velocities. For a random
+            walk they are `filtered`; with velocities each image has a weight below 1, because
+            errors persist.
+        identities: (N,) persistent numbers, see `Identities`.
+        origins: (N, M) probability that mode n continues mode m of the previous image; M is 0 at a
             start.
-        back: (N,) modes that face the other way than the heaviest, which is the first.
-        facing: (N,) log odds of the facing direction of each, see `classes`.
+        back: (N,) whether each mode faces opposite to the heaviest, which is the first.
+        facing: (N,) log odds of the facing direction of each mode, see `classes`.
         soles: (N, P, 3) points of the soles, m.
-        contacts: (N, P) probabilities that these rest on the floor, see `body.foot_contact`.
+        contacts: (N, P) probabilities that sole points rest on the floor, see `body.foot_contact`.
     """
 
     velocities: Array
@@ -151,7 +151,7 @@ class Modes(Hypotheses):
 
     @classmethod
     def blank(cls, count: int, dimension: int) -> Modes:
-        """K modes with all values zero or empty; K is 0 without a track."""
+        """Modes (count,) with all values zero or empty; count is 0 without a track."""
         numbers, vectors = np.zeros(count), np.zeros((count, dimension))
         matrices, nothing = np.zeros((count, dimension, dimension)), np.zeros((count, 0))
         return cls(
@@ -179,24 +179,24 @@ class Modes(Hypotheses):
 class Identities:
     """Persistent numbers of the modes of a track, from 1 on.
 
-    A mode inherits the number of its ancestor if it is the heaviest descendant without a jump, or,
-    where every descendant jumped, the heaviest that did not jump with all degrees of freedom. Every
-    other mode gets a new number.
+    The heaviest descendant without a jump inherits the number of its ancestor. If every descendant
+    jumped, the heaviest with some unjumped degree of freedom inherits it. All other modes get new
+    numbers.
     """
 
     def __init__(self) -> None:
         self._last = 0
 
     def new(self, count: int) -> Index:
-        """Unused numbers (count,)."""
+        """Returns unused numbers (count,)."""
         first, self._last = self._last + 1, self._last + count
         return np.arange(first, self._last + 1)
 
     def of(self, hypotheses: Hypotheses, before: Modes | None) -> Index:
-        """Numbers (N,) of hypotheses that become modes, heaviest first.
+        """Returns numbers (N,) for hypotheses that become modes.
 
         Args:
-            hypotheses: N.
+            hypotheses: N hypotheses, heaviest first.
             before: modes of the previous image; None: the track starts.
         """
         if before is None:
@@ -217,10 +217,10 @@ class Identities:
 
 
 def new_hypotheses(poses: Array, log_weights: Array, exchanges: Array | None = None) -> Hypotheses:
-    """Hypotheses (N, d), each its own ancestor.
+    """Creates hypotheses (N, d), each its own ancestor.
 
     Args:
-        poses, log_weights: (N, d), (N,).
+        poses, log_weights: poses (N, d) and log weights (N,).
         exchanges: (N, E) log probabilities of exchanged sides; None: unknown.
     """
     everyone = np.arange(len(poses))
@@ -235,11 +235,11 @@ class PosePrediction:
     """Poses from an external single-image predictor, such as a mixture of experts.
 
     Attributes:
-        mixture: over poses (d,), with some weight above 0.
-        body: of the poses, with the assumed lengths.
+        mixture: mixture over poses (d,), with some weight above 0.
+        body: body of the poses, with its assumed lengths.
 
     Raises:
-        ValueError: a mixture that is not over poses of the body.
+        ValueError: the mixture has another dimension than the body, or no weight.
     """
 
     mixture: GaussianMixture
@@ -255,10 +255,10 @@ class PosePrediction:
             raise ValueError('a prediction has no weight')
 
     def seen_as(self, body: Body) -> GaussianMixture:
-        """The mixture for a body of other lengths or level; distances scale with its size.
+        """Converts the mixture to a body of other lengths or level; distances scale with size.
 
         Raises:
-            ValueError: a body with other degrees of freedom.
+            ValueError: the body has other degrees of freedom.
         """
         if body.dof_names != self.body.dof_names:
             raise ValueError(
@@ -273,7 +273,7 @@ class PosePrediction:
         )
 
     def both_ways(self, body: Body) -> GaussianMixture:
-        """As `seen_as`, with the reversals in depth, which have nearly the same silhouettes."""
+        """Like `seen_as`, plus reversals in depth, which have nearly the same silhouettes."""
         seen = self.seen_as(body)
         return GaussianMixture(
             np.tile(0.5 * seen.weights, 2),

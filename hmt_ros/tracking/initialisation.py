@@ -2,11 +2,12 @@
 
     E(x, l) = 1/2 sum_j |u_j(x, l) - p_j|^2_j + E_prior(x) + 1/2 (l - l_0)' S_l^-1 (l - l_0)
 
-u_j projects joint j, seen at p_j, of the pose x with the lengths l; the norm is that of the
-keypoint's covariance. From several headings, pose and lengths are fitted together. The prior of a
-length is its measurement or its spread over people; known gravity makes the pose upright, and a
-depth image gives depths of joints. The lengths are then fixed, the flips of all limbs that the
-image and the limits allow are enumerated and fitted again, and the best are the first mixture.
+u_j is the projection of joint j for the pose x and the lengths l, and p_j its keypoint; the norm
+uses the keypoint's covariance. Pose and lengths are fitted together, from several headings. The
+prior of a length is its measurement or its spread over people; known gravity makes the pose
+upright, and a depth image gives depths of joints. The lengths are then fixed. The flips of all
+limbs that the image and the limits allow are enumerated and fitted again, and the best ones form
+the first mixture.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ from hmt_ros.tracking.settings import (
 )
 from hmt_ros.tracking.validity import UNDECIDED
 
-# Standard deviation of a measured stature, m: the model lacks the person's skull and heels.
+# Standard deviation of a measured stature, m: the model has no skull and no heels.
 STATURE_SIGMA = 2.0 * MEASURED_SIGMA
 NO_POSE = 'no pose of the body explains the keypoints: are they in the image?'
 LEAST_SQUARES = TermSettings(1.0, 1.0, np.inf)
@@ -58,13 +59,13 @@ LEAST_SQUARES = TermSettings(1.0, 1.0, np.inf)
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Body and poses that a track starts from.
+    """Body and poses from which a track starts.
 
     Attributes:
-        body: of the person; its shape is estimated while the track lasts.
-        poses: (M, d) distinct poses, best first, or the means of `expected`.
+        body: body of the person; its shape is estimated while the track lasts.
+        poses: (M, d) distinct poses, best first; with `expected`, its means.
         expected: mixture over poses; None: all poses have the same weight.
-        clicked: keypoints that replace those of the image in the fit of the start.
+        clicked: keypoints of a subject file, which replace the detected ones at the start.
     """
 
     body: Body
@@ -74,7 +75,7 @@ class Start:
 
     @property
     def best(self) -> Array:
-        """The most probable pose (1, d)."""
+        """Most probable pose (1, d)."""
         return self.poses[[0 if self.expected is None else int(self.expected.weights.argmax())]]
 
 
@@ -86,18 +87,18 @@ def start_from_keypoints(
     upright: Gravity | None = None,
     depths: ImageMap | None = None,
 ) -> Start:
-    """All poses that explain the joints of a subject, and the body with the subject's lengths.
+    """Poses that explain the joints of a subject, and the body with the subject's lengths.
 
     Args:
         body: model of the person.
-        camera: that saw the joints.
-        subject: joints, and measurements of the person.
+        camera: camera that saw the joints.
+        subject: joints and measurements of the person.
         upright: gravity; None: unknown, and the prior keeps the root near the camera's axes.
-        depths: of the image with the joints; None: unknown. They are dropped if they give an
-            impossible stature, or do not show the surface of the best pose.
+        depths: depths of the image with the joints; None: unknown. They are dropped if the stature
+            becomes implausible, or if they do not show the surface of the best pose.
 
     Raises:
-        ValueError: joints from which no pose can be fitted.
+        ValueError: no pose can be fitted to the joints.
     """
     sized, keypoints = _sized(body, subject), subject.keypoints
     fits = _fit_with_lengths(
@@ -132,7 +133,7 @@ def _with_flips(
     """Distinct poses (M, d) that explain joints, best first, from guesses (N, d) and their flips.
 
     Raises:
-        ValueError: no pose can be fitted.
+        ValueError: no pose fits.
     """
     least_squares = LikelihoodSettings.of_terms(keypoints=LEAST_SQUARES, depth=DEPTH.settings)
     settings = replace(least_squares, prior_weight=1.0)
@@ -161,12 +162,12 @@ def poses_from_keypoints(
     upright: Gravity | None = None,
     depths: ImageMap | None = None,
 ) -> Array:
-    """Poses (M, d) of a body of known lengths that explain the joints of an image, best first.
+    """Poses (M, d) that explain the joints of an image, best first, with known lengths.
 
     Depths that do not show the surface of the best pose are not used.
 
     Raises:
-        ValueError: joints from which no pose can be fitted.
+        ValueError: no pose can be fitted to the joints.
     """
     measured = joint_depths(body, keypoints, depths)
     guesses = _first_guesses(body, camera, keypoints, upright, measured)
@@ -179,16 +180,16 @@ def poses_from_keypoints(
 
 
 def poses_from_outline(body: Body, camera: Camera, outline: Outline) -> Array:
-    """Mean poses (HEADINGS, d) of all headings, at the place and height of the silhouette."""
+    """Mean poses (HEADINGS, d) at several headings, scaled and placed to fit the silhouette."""
     rays = _level_rays(body, camera, outline.pixels)
     return _poses_between(body, *np.quantile(rays, [0.02, 0.98], axis=0))
 
 
 def mixture_from_box(body: Body, camera: Camera, box: Box) -> GaussianMixture:
-    """Mean poses of all headings in a box (left, top, right, bottom), px.
+    """Mixture of mean poses at several headings that fill a box (left, top, right, bottom), px.
 
-    Limbs have the variances of the body's prior; the deviation of the place is a fraction of the
-    distance.
+    Limbs have the variances of the body's prior; the standard deviation of the place is the
+    fraction `BOX_SIGMA` of the distance.
     """
     left, top, right, bottom = box
     middle = (0.5 * (left + right), 0.5 * (top + bottom))
@@ -209,7 +210,7 @@ def check_box(box: Box, camera: Camera) -> None:
     """Checks the box (left, top, right, bottom) of a person, px.
 
     Raises:
-        ValueError: numbers that are not finite, a box without an area or outside the image.
+        ValueError: a number is not finite, or the box has no area or is outside the image.
     """
     left, top, right, bottom = box
     if not np.isfinite(box).all() or left >= right or top >= bottom:
@@ -222,13 +223,13 @@ def check_box(box: Box, camera: Camera) -> None:
 
 
 def _level_rays(body: Body, camera: Camera, pixels: Array) -> Array:
-    """Rays (N, 2), x / z and y / z along the axes of the body's level, of pixels (N, 2)."""
+    """Rays (N, 2) of pixels (N, 2): x / z and y / z in the axes of the body's level."""
     rays = product(camera.rays(pixels), body.level)
     return np.asarray(rays[:, :2] / rays[:, 2:])
 
 
 def _poses_between(body: Body, low: Array, high: Array) -> Array:
-    """Mean poses (HEADINGS, d) of all headings between two corners (2,) of a box of level rays."""
+    """Mean poses (HEADINGS, d) at several headings that fill a box of level rays (2,)."""
     middle = 0.5 * (low + high)
     result = np.tile(body.prior_mean, (HEADINGS, 1))
     result[:, :3] = 0.0
@@ -243,13 +244,13 @@ def _poses_between(body: Body, low: Array, high: Array) -> Array:
 
 
 def _sized(body: Body, subject: Subject) -> Body:
-    """The body with the measured lengths of the person, and their covariance."""
+    """Body with the measured lengths of the person, and their covariance."""
     if subject.stature is not None:
         body = body.with_stature(subject.stature)
     known = subject.segment_lengths
     names = body.skeleton.length_names
     if known:
-        # Lengths without a measurement scale with the measured ones.
+        # Unmeasured lengths are scaled like the measured ones.
         factor = sum(known.values()) / sum(body.segment_lengths[x] for x in known)
         scaled = {x: body.segment_lengths[x] * factor for x in names if x not in known}
         body = body.with_segment_lengths({**scaled, **known})
@@ -263,7 +264,7 @@ def _sized(body: Body, subject: Subject) -> Body:
 
 
 def _is_a_stature(body: Body, lengths: Array) -> bool:
-    """Whether lengths (L,) give a plausible stature."""
+    """Whether the stature with lengths (L,) is plausible."""
     rates = body.stature_rates
     change = float(product(rates, lengths - body.skeleton.lengths))
     variance = float(product(product(rates, body.length_covariance), rates)) + STATURE_SIGMA**2
@@ -306,7 +307,7 @@ def _fit_with_lengths(
             if len(error) < residuals:
                 value[i], gradient[i], hessian[i] = np.inf, 0.0, np.eye(d + count)
                 continue
-            # Rows of the keypoints, then of the depths of joints.
+            # The first rows are keypoints, the others depths of joints.
             far = frames.joints()[measured.joints, :, 0]
             cost, pull, curvature = measured.residuals(far[:, 2])
             joints = np.concatenate([joints, measured.joints])
@@ -347,7 +348,7 @@ def _fit_with_lengths(
         axis=1,
     )
     reach = 5.0 * sigma
-    # A length that varies by more than itself may be negative.
+    # A length with a standard deviation larger than itself may become negative.
     least = np.where(sigma < default, np.finfo(np.float64).eps, -np.inf)
     return minimise(
         EnergyFunction(energy),
@@ -368,7 +369,7 @@ def _first_guesses(
     upright: Gravity | None,
     measured: JointDepths,
 ) -> Array:
-    """Mean poses at several headings, placed at the joints, at a distance given by their spread."""
+    """Mean poses at several headings, placed at the keypoints; their spread gives the distance."""
     seen = keypoints.seen
     pixels = keypoints.pixels[seen]
     names = [x for x, ok in zip(keypoints.names, seen, strict=True) if ok]
@@ -377,7 +378,7 @@ def _first_guesses(
     pose = body.prior_mean.copy()
     pose[~body.skeleton.dof_is_rotation] = 0.0
     joints = body.joint_positions(pose[None])[0][body.skeleton.joint_index(names)]
-    # Depth = size in space over size in the image; the fit corrects errors by arms and heading.
+    # Depth = size in space / size in the image; the fit corrects errors due to arms and heading.
     extent = np.linalg.norm(rays - rays.mean(0), axis=1).mean()
     spread = np.linalg.norm((joints - joints.mean(0))[:, :2], axis=1).mean()
     if not extent > 0:
@@ -397,7 +398,7 @@ def _first_guesses(
 
 
 def _distinct(solved: Minimum, body: Body, count: int) -> Minimum:
-    """The best minima whose joints differ by more than `START_DISTANCE` somewhere."""
+    """The best minima that differ by more than `START_DISTANCE` in some joint."""
     order = np.argsort(solved.value, kind='stable')
     order = order[np.isfinite(solved.value[order])]
     distinct = distinct_poses(body.joint_positions(solved.x[order]), START_DISTANCE, count)

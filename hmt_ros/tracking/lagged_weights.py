@@ -1,9 +1,9 @@
-"""Weights of the modes of an image, smoothed over the L images after it.
+"""Weights of the modes of an image, smoothed over the next L images.
 
-They result from forward filtering, backward smoothing (`inference.mode_chain`) in a window of the
-image and the L after it. The evidence of an image for mode k, or for its facing direction
-(`classes`), is a factor of w_k alone. So the lagged weights are consistent with the published ones,
-which are those of L = 0: they are sums over all histories of the modes. If a mode represents
+The weights result from forward filtering and backward smoothing (`inference.mode_chain`) over the
+image and the next L images. The evidence of an image for mode k, or for its facing direction
+(`classes`), is a factor of w_k only. So the lagged weights are consistent with the published
+weights, which have L = 0: both are sums over all histories of the modes. If a mode represents
 several hypotheses, P is their mean (`weighting.pooled_origins`).
 """
 
@@ -18,11 +18,11 @@ from hmt_ros.inference.mode_chain import Link, backward_weights
 
 
 class Lagged(NamedTuple):
-    """The posterior of an image, with weights by later images.
+    """Posterior of an image, with weights smoothed over later images.
 
     Attributes:
-        stamp: of the image, ns.
-        posterior: of the image, with lagged weights; components are in the published order.
+        stamp: timestamp of the image, ns.
+        posterior: posterior of the image, with lagged weights; components in the published order.
     """
 
     stamp: int
@@ -30,7 +30,7 @@ class Lagged(NamedTuple):
 
 
 class LaggedWeights:
-    """Posteriors of a track, each with the weights that the next `lag` images give it.
+    """Collects the posteriors of a track; smooths their weights over the next `lag` images.
 
         lagged = LaggedWeights(10)
         for stamp, image in images:
@@ -40,7 +40,7 @@ class LaggedWeights:
         found += lagged.finish()
 
     Args:
-        lag: number of images, L; 0 returns the published posteriors.
+        lag: number L of later images; 0 returns the published posteriors.
 
     Raises:
         ValueError: the lag is negative.
@@ -50,24 +50,24 @@ class LaggedWeights:
         if lag < 0:
             raise ValueError(f'lag must not be negative, saw {lag}')
         self.lag = lag
-        # At most L + 1 posteriors without a result, with their origins in the previous one.
+        # At most L + 1 posteriors that await their result, with their origins.
         self._waiting: list[tuple[Lagged, Array]] = []
 
     def update(self, stamp: int, posterior: GaussianMixture, origins: Array) -> list[Lagged]:
         """Adds the posterior of the next image.
 
         Args:
-            stamp: of the image, ns.
+            stamp: timestamp of the image, ns.
             posterior: K components.
-            origins: (K, M) probability that each continues component m of the previous image; M is
-                0 where a track starts.
+            origins: (K, M) probability that component k continues component m of the previous
+                image; M is 0 at the start of a track.
 
         Returns:
-            The image L before this one, if it is of the same track; where a track starts, all
-            remaining images of the previous one. Oldest first.
+            Finished posteriors, oldest first: that of L images ago, if it belongs to the same
+            track; at the start of a track also all remaining posteriors of the previous track.
 
         Raises:
-            ValueError: origins of another shape.
+            ValueError: the origins have another shape.
         """
         begins = origins.shape[1] == 0
         result = self.finish() if begins else []
@@ -81,12 +81,12 @@ class LaggedWeights:
         return result
 
     def finish(self) -> list[Lagged]:
-        """The remaining images, weighted by fewer than L later ones."""
+        """Returns the remaining posteriors, smoothed over fewer than L later images."""
         result, self._waiting = self._smoothed(), []
         return result
 
     def _smoothed(self) -> list[Lagged]:
-        """The waiting images, each weighted by all later ones."""
+        """Returns the waiting posteriors, each smoothed over all later images."""
         if not self._waiting:
             return []
         links = [Link(one.posterior.weights, origins) for one, origins in self._waiting]

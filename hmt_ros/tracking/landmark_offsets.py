@@ -1,11 +1,11 @@
-"""Places of the landmarks of one person, learned while other cues show where the person is.
+"""Landmark offsets of one person, learned while other cues locate the person.
 
     pixel_l = project(J_l + R_l (o_l + d_l)) + e,     d_l ~ N(0, PRIOR^2)
 
-o_l is the usual offset of landmark l in the frame of its segment R_l, d_l the addition by this
-person, these clothes and this detector. Errors of a keypoint persist for seconds, so at most `RATE`
-images a second count. Keypoints alone can not distinguish an offset from a pose: edges or
-silhouettes must be evidence, too.
+o_l is the usual offset of landmark l in the frame of its segment, R_l, and d_l the deviation due to
+person, clothes and detector. Errors of a keypoint persist for seconds, so at most `RATE` images per
+second count. Keypoints alone cannot distinguish an offset from a pose, so edges or silhouettes must
+be evidence, too.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import product, solve
 
-# Standard deviations of an offset d_l, and of the error of a keypoint at the person, m.
+# Standard deviations of an offset d_l, and of a keypoint's error at the person's distance, m.
 PRIOR, SIGMA = 0.02, 0.03
-# Scale of the robust kernel, m; least confidence of a keypoint; effective images per second.
+# Scale of the robust kernel, m; minimum confidence of a keypoint; effective images per second.
 KERNEL, LEAST_CONFIDENCE, RATE = 0.06, 0.5, 4.0
 
 
@@ -33,8 +33,8 @@ class LandmarkOffsets:
 
     Attributes:
         landmarks: names of n landmarks; empty if unknown.
-        precision: (n, 3, 3) information on the offsets, 1/m^2.
-        pull: (n, 3) information times offsets, 1/m.
+        precision: (n, 3, 3) precisions of the offsets, 1/m^2.
+        pull: (n, 3) precisions times offsets, 1/m.
     """
 
     landmarks: tuple[str, ...] = ()
@@ -43,12 +43,12 @@ class LandmarkOffsets:
 
     @cached_property
     def offsets(self) -> Array:
-        """The most probable offsets (n, 3), m."""
+        """Most probable offsets (n, 3), m."""
         known = self.precision + np.eye(3) / PRIOR**2
         return np.asarray(solve(known, self.pull[..., None])[..., 0])
 
     def applied(self, keypoints: Keypoints | None) -> Keypoints | None:
-        """Keypoints with the offsets of this person."""
+        """Returns keypoints with the offsets of this person added."""
         if keypoints is None or keypoints.offsets is None or keypoints.landmarks != self.landmarks:
             return keypoints
         return replace(keypoints, offsets=keypoints.offsets + self.offsets)
@@ -56,11 +56,11 @@ class LandmarkOffsets:
     def after(
         self, keypoints: Keypoints, body: Body, camera: Camera, pose: Array, dt: float
     ) -> LandmarkOffsets:
-        """The estimate after an image.
+        """Returns the estimate after an image.
 
         Args:
-            keypoints: of the image, returned by `applied`.
-            body, pose: the person at the pose (d,) by all cues.
+            keypoints: keypoints of the image, as returned by `applied`.
+            body, pose: body, and its pose (d,) according to all cues.
             dt: time since the previous image, s.
         """
         if keypoints.landmarks is None or keypoints.offsets is None:

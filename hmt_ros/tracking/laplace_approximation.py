@@ -1,17 +1,18 @@
-"""Gaussians around optima: the modes of the posterior, and those of the likelihood alone.
+"""Gaussians around optima: the modes of the posterior and of the likelihood.
 
     filtered     H^-1                                      as if errors were independent
     covariance   T (H_prior + sum_g a_g(dt) H_g)^-1 + J P J'               g: image, keypoints
     state        N(pose, velocity) conditioned on the found pose; see `motion_states`
 
-H is the Gauss-Newton Hessian of the energy at an optimum, H_prior that of body and ground, without
-the motion prior. Errors persist, so a cue counts with its share a_g, and the covariance given all
-images so far is T times that given one (`inference.error_model`). Uncertainty of the shape makes
-the pose uncertain: J P J' (`shape_estimation`). A variable on its limit hardly varies.
+H is the Gauss-Newton Hessian of the energy at an optimum, and H_prior the Hessian of the terms of
+body and ground, without the motion prior. Errors persist, so a cue counts with its share a_g, and
+the covariance given all images so far is T times the covariance given one image
+(`inference.error_model`). Uncertainty of the shape makes the pose uncertain: J P J'
+(`shape_estimation`). A variable on its limit hardly varies.
 
-The likelihood alone is published undiscounted, together with the duration of its errors: the
-consumer that combines images discounts them once. The error due to the shape is the same in all
-images; its covariance is published beside the likelihood.
+The likelihood is published undiscounted, with the correlation time of its errors, so that a
+subscriber that combines images discounts them once. The error due to the shape is the same in all
+images; its covariance is published separately.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from hmt_ros.tracking.settings import MAX_MODE_SHIFT
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
 from hmt_ros.tracking.weighting import at_least, normalised
 
-# Smallest log weight of a mode of a likelihood, nats, whose exponential does not underflow.
+# Smallest log weight of a mode of a likelihood, nats: its exponential does not underflow.
 MIN_LOG_WEIGHT = elementary.log(np.finfo(np.float64).tiny)
 
 
@@ -49,18 +50,18 @@ class Likelihood:
     """The likelihood of an image as a function of the pose, undiscounted.
 
     Attributes:
-        mixture: exp(-E) up to a factor, E the energy of the image: covariances S by the whole
-            curvature, weights exp(-E) |S|^(1/2); heaviest mode first.
+        mixture: approximation of exp(-E) up to a factor, with the energy E of the image:
+            covariances S from the full curvature, weights exp(-E) |S|^(1/2); heaviest mode first.
         values: (K,) log likelihoods of the image at the means, nats.
-        errors: duration of its errors, all cues together.
-        shape_covariance: (d, d) J P J' at the heaviest mode of the posterior.
-        modes: (K,) row of the posterior mode that each component belongs to.
-        posterior_weights: (K,) of these modes, given all images so far; they sum to 1.
-        identities: (K,) of these modes, see `Identities`.
-        origins: (K, M) probability that each continues component m of the likelihood of the
-            previous image; M is 0 at a start. See `LaggedWeights`.
-        ancestors: (M,) identities of those components.
-        ancestry_stamp: of the previous image, ns; None: the track starts.
+        errors: error model of all cues together.
+        shape_covariance: (d, d) covariance J P J' due to the shape at the heaviest posterior mode.
+        modes: (K,) row of the posterior mode of each component.
+        posterior_weights: (K,) weights of these posterior modes, given all images so far; sum 1.
+        identities: (K,) persistent numbers of these posterior modes, see `Identities`.
+        origins: (K, M) probability that component k continues component m of the previous image's
+            likelihood; M is 0 at a start. See `LaggedWeights`.
+        ancestors: (M,) identities of the previous image's components.
+        ancestry_stamp: timestamp of the previous image, ns; None: the track starts.
     """
 
     mixture: GaussianMixture
@@ -86,14 +87,14 @@ def posterior_modes(
     states: PredictedStates | None,
     dt: float,
 ) -> Modes:
-    """The modes of the posterior, without their identities and classes.
+    """Computes the modes of the posterior, without their identities and classes.
 
     Args:
         selected: K hypotheses at their optima, heaviest first.
-        log_weights: (K,) normalised.
-        origins: (K, M) probability that each continues mode m of the previous image.
-        posterior: of the image.
-        observation: of the image.
+        log_weights: (K,) normalised log weights.
+        origins: (K, M) probability that mode k continues mode m of the previous image.
+        posterior: posterior of the image.
+        observation: observation of the image.
         shape: present estimate of the person's shape.
         dynamics: motion prior of the modes.
         states: predicted states of the ancestors; None: the track starts, at rest.
@@ -116,7 +117,7 @@ def posterior_modes(
     else:
         found = filtered
         if states.wandered.any() and measured:
-            # Errors of images persist, so the propagated covariance uses their share, too.
+            # Errors of images persist, so the propagated covariance is discounted, too.
             found = fused(states.covariances_of(h.ancestors, h.jumped), alone)
         velocities, state_covariances = states.given(h.ancestors, h.jumped, poses, found)
     return replace(
@@ -142,19 +143,20 @@ def likelihood_modes(
     shape: ShapeEstimate,
     before: tuple[int | None, Likelihood],
 ) -> Likelihood:
-    """The modes of the likelihood alone, without information from previous images.
+    """Computes the modes of the likelihood, without information from previous images.
 
     Around each mode of the posterior the energy of the image and of the body's prior is
-    approximately quadratic. Its minimum and curvature give a component, its depth and volume the
-    weight, of at least `MIN_LOG_WEIGHT`. Nothing is discounted, except that one pair (s, tau)
-    describes keypoints and experts, with the same information per second as in the filter.
+    approximately quadratic. Its minimum and curvature give a component, and its depth and volume
+    give the log weight, which is at least `MIN_LOG_WEIGHT`. Nothing is discounted, except that one
+    pair (s, tau) describes keypoints and experts, with the same information per second as in the
+    filter.
 
     Args:
-        modes: of the posterior, K, heaviest first.
-        posterior: of the image.
-        observation: of the image.
+        modes: K modes of the posterior, heaviest first.
+        posterior: posterior of the image.
+        observation: observation of the image.
         shape: present estimate of the person's shape.
-        before: stamp, ns, and likelihood of the previous image; unused at a start.
+        before: timestamp, ns, and likelihood of the previous image; unused at a start.
     """
     body, poses = posterior.body, modes.poses
     fit = posterior.fit(poses, observation, LIFTED_AS_KEYPOINTS)
@@ -190,9 +192,10 @@ def likelihood_modes(
 
 
 def _errors(fit: ImageFit, weights: Array) -> CueErrors:
-    """Duration of the errors of an energy with the Hessian H = sum_g H_g, of inverse S, at a mode.
+    """Error model of an energy whose Hessian is H = sum_g H_g, with the inverse S, at each mode.
 
-    A cue counts with the number of variables that it determines, tr(S H_g), averaged over modes.
+    Each cue has the weight tr(S H_g), the number of variables that it determines, averaged over
+    modes.
     """
     amounts = np.empty(3)
     determined(weights, fit.covariances, fit.hessians, amounts)

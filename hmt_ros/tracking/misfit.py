@@ -1,12 +1,12 @@
 """Share of each cue of an image that no mode explains, from 0 to 1.
 
-    silhouette   visible points of the model outside it
-    outline      samples of the silhouette's outline further than `GATE_SIGMAS` from the model's
-    keypoints    those of a group further than `GATE_SIGMAS` from their landmarks
+    silhouette   visible points of the model that are not foreground
+    outline      samples of the silhouette's outline over `GATE_SIGMAS` from the model's outline
+    keypoints    keypoints of a group over `GATE_SIGMAS` from their landmarks
     depth        energy of the visible surface, as a share of the largest possible
 
-Clothes in the colours of the scene are not foreground, nor is the person in a mask of another
-image. A depth image that is late or not registered shows the background where the model has limbs,
+Clothes in the colours of the scene are not foreground, and a mask of another image misses the
+person. A depth image that is late or not registered shows the background at the limbs of the model,
 so that most points have the maximum cost of their kernel at any pose.
 """
 
@@ -31,16 +31,16 @@ from hmt_ros.image.terms.keypoints import EXCHANGED, KeypointTerm
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.tracking.settings import GATE_SIGMAS
 
-# Keys of the misfits. That of the silhouette's outline is evidence about the track alone.
+# Keys of the misfits. The misfit of the silhouette's outline is evidence about the track only.
 SILHOUETTE, OUTLINE, KEYPOINTS = 'silhouette', 'outline', 'keypoints'
 
 
 class Misfit(NamedTuple):
-    """Share of a cue that is not explained, by group.
+    """Unexplained share of a cue, by group.
 
     Attributes:
-        shares: (G,) unexplained, from 0 to 1.
-        counts: (G,) number of measurements; 0: unknown.
+        shares: (G,) unexplained shares, from 0 to 1.
+        counts: (G,) numbers of measurements; 0: share unknown.
     """
 
     shares: Array
@@ -48,7 +48,7 @@ class Misfit(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Share over all measurements together; 0 without any."""
+        """Unexplained share of all measurements together; 0 without measurements."""
         return float((self.shares * self.counts).sum() / max(self.counts.sum(), 1.0))
 
 
@@ -63,15 +63,15 @@ def of_silhouette(
 ) -> dict[str, Misfit]:
     """Misfits of a silhouette and of its outline, given modes.
 
-    Empty without a silhouette. An empty silhouette has no misfit of points, unless there are
-    keypoints.
+    Without a silhouette the result is empty. The misfit of points to an empty silhouette is left
+    out, unless there are keypoints.
 
     Args:
-        body, camera, poses: the modes (K, d), heaviest first.
-        observation: of the image; its outline counts even if the likelihood does not use it.
-        term: settings of the energies of the samples.
-        costs: (K, M) of these samples in the likelihood.
-        points: visible points of the modes, if they are known.
+        body, camera, poses: body, camera and poses (K, d) of the modes, heaviest first.
+        observation: observation of the image; its outline is used even if the likelihood does not.
+        term: settings of the energies of outline samples.
+        costs: (K, M) energies of outline samples in the likelihood.
+        points: visible surface points of the modes; None: unknown.
     """
     found: dict[str, Misfit] = {}
     foreground, beliefs = observation.foreground, observation.beliefs
@@ -92,8 +92,8 @@ def of_points(points: SurfacePoints, row: int, foreground: Mask) -> Misfit:
 
     Args:
         points: visible points of the modes.
-        row: of the mode.
-        foreground: (H, W).
+        row: row of the mode.
+        foreground: (H, W) foreground mask.
     """
     n = int(points.counts[row])
     column, line = points.pixels[row, :n].T.round().astype(np.intp)
@@ -109,8 +109,8 @@ def of_outline(costs: Array, term: TermSettings, belief: float) -> float:
 
     Args:
         costs: (K, M) energies of the samples at the modes.
-        term: settings of these energies: the weight, shared among the samples, and the kernel.
-        belief: factor on the weight.
+        term: settings of the energies: their weight, shared among the samples, and the kernel.
+        belief: factor on the weight of the term.
     """
     if costs.size == 0:
         return 0.0
@@ -125,8 +125,8 @@ def outline_costs(
     """Energies (K, M) of samples of the outline of a silhouette at poses (K, d).
 
     Args:
-        body, camera, poses: that the silhouette is compared with.
-        foreground: (H, W), which the likelihood does not use.
+        body, camera, poses: body, camera and poses to compare with the silhouette.
+        foreground: (H, W) silhouette, which the tracker's likelihood does not use.
         term: settings of the energies.
     """
     if not foreground.any():
@@ -138,9 +138,9 @@ def outline_costs(
 
 
 def of_keypoints(term: KeypointTerm, poses: Array) -> Misfit:
-    """Share of the keypoints that the best of poses (K, d) does not explain, by group.
+    """Share of the keypoints of each group that the best of poses (K, d) does not explain.
 
-    Each pose uses its most likely exchange of sides.
+    For each pose the most likely exchange of sides is assumed.
     """
     groups = term.measured.points.groups
     count = EXCHANGED.shape[1]
@@ -165,9 +165,9 @@ def of_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap) -> Arra
 
 
 def of_depth_at_best(body: Body, camera: Camera, pose: Array, depths: ImageMap) -> float:
-    """The smaller share of a pose (d,) and of this pose moved to the measured depth.
+    """Unexplained share of depths at a pose (d,), or at this pose moved to them if smaller.
 
-    A track that used no depth may be at a wrong distance.
+    A track without depths may be at a wrong distance.
     """
     poses = np.concatenate([pose[None], moved_to_depth(body, camera, pose[None], depths)])
     return float(of_depth(body, camera, poses, depths).min())

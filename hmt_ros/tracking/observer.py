@@ -1,10 +1,10 @@
-"""Inputs of a tracker from an image: a view of any person, and the evidence about the person.
+"""Inputs of a tracker from an image: a view of a person, and an observation of the person.
 
     view          silhouettes near the person and anywhere, keypoints     before a pose is known
     observation   evidence of every term of the likelihood in use         near a pose
 
-Existence and starts are decided from the view. The observation is made from it once the place of
-the person and the validity of the silhouettes are known.
+Existence and starts depend on the view. The observation is made from the view once the place of the
+person and the validity of the silhouettes are known.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ from hmt_ros.tracking.validity import Validity
 
 
 class View(NamedTuple):
-    """An image with its inputs, and the view of a person in it before a pose is known.
+    """An image with its inputs, and what it shows before a pose is known.
 
     Attributes:
-        image: (H, W, 3) BGR.
-        stamp: of the image, ns.
-        keypoints: of a detector, which saw nobody if no keypoint is seen; None: no detector, or no
-            answer.
+        image: (H, W, 3) BGR image.
+        stamp: timestamp of the image, ns.
+        keypoints: keypoints from a detector, which saw nobody if no keypoint is seen; None: no
+            detector, or no answer.
         prediction: pose hypotheses from an external predictor, if any.
-        mask: (H, W) of a segmenter; None: unknown.
+        mask: (H, W) pixels of the person from a segmenter; None: unknown.
         predicted: whether a predictor found a person in this image; None: no predictor, or no
             answer.
         others: (H, W) pixels that other people cover; None: no such pixels.
         depth: (H, W) depth along the axis of the camera, m; None: unknown.
-        silhouette: (H, W) foreground near the person, may be empty; None: neither background nor
+        silhouette: (H, W) foreground near the person, possibly empty; None: neither background nor
             mask.
-        anywhere: (h, w) all foreground of the image, on a coarser raster; None: as for
-            `silhouette`.
+        anywhere: (h, w) all foreground of the image on a coarser raster; None: neither background
+            nor mask.
         changed: share of the pixels that differ from the background.
-        unsure: (H, W) pixels of the person or of a shadow; None: no such pixels.
-        hidden: (S,) segments that something else covers; None: no such segments.
+        unsure: (H, W) pixels that show the person or a shadow; None: no such pixels.
+        hidden: (S,) segments that other objects cover; None: no such segments.
     """
 
     image: Image
@@ -72,12 +72,12 @@ class Observer:
     """Makes views and observations for the terms of a likelihood.
 
     Args:
-        camera: that takes the images.
-        settings: of the tracker; terms of weight 0 get no evidence.
+        camera: camera of the images.
+        settings: settings of the tracker; terms of weight 0 get no evidence.
         silhouettes: source of the silhouettes.
 
     Attributes:
-        last_image: (H, W, 3) that the optical flow starts from; None: no flow.
+        last_image: (H, W, 3) image from which the optical flow starts; None: no flow.
     """
 
     def __init__(self, camera: Camera, settings: TrackerSettings, silhouettes: Silhouettes) -> None:
@@ -91,12 +91,12 @@ class Observer:
 
         Args:
             given: the image with its inputs.
-            body: whose degrees of freedom a prediction must have.
-            last: stamp of the previous image, ns; None: first image.
+            body: body with the degrees of freedom that a prediction must have.
+            last: timestamp of the previous image, ns; None: first image.
 
         Raises:
-            ValueError: an array that does not have the size of the camera's images, a stamp that
-                does not increase, or a prediction of a body with other degrees of freedom.
+            ValueError: an array does not have the size of the camera's images, the timestamp does
+                not increase, or the body of the prediction has other degrees of freedom.
         """
         if given.prediction is not None:
             given.prediction.seen_as(body)
@@ -113,13 +113,13 @@ class Observer:
                 raise ValueError(f'the camera gives images of {size}, saw {name}{each.shape[:2]}')
 
     def view(self, given: View, body: Body, poses: Array | None, dt: float) -> View:
-        """The view of a person in an image.
+        """Makes the view of a person in an image.
 
         Args:
             given: the image with its inputs, without silhouettes.
-            body: of the person.
-            poses: (K, d) in an earlier image; None: the person may be anywhere.
-            dt: time since that image, s.
+            body: body of the person.
+            poses: (K, d) poses in an earlier image; None: the person may be anywhere.
+            dt: time since the earlier image, s.
         """
         if self._settings.likelihood.coverage.weight == 0:
             return given
@@ -137,12 +137,12 @@ class Observer:
         )
 
     def observation(self, view: View, pose: Array | None, validity: Validity) -> Observation:
-        """The evidence of an image about a person.
+        """Makes the observation of a person in an image.
 
         Args:
-            view: of the image.
-            pose: (d,) approximate; None: unknown.
-            validity: of the cues; those that more likely show something else are left out.
+            view: view of the image.
+            pose: (d,) approximate pose; None: unknown.
+            validity: validity of the cues; cues that more likely show something else are left out.
         """
         likelihood = self._settings.likelihood
         weighed = [term for term in TERMS if getattr(likelihood, term.name).weight > 0]

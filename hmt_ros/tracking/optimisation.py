@@ -2,14 +2,14 @@
 
 x_k = argmin E(x)          bounded Newton from x_k^0, within the joint limits
 
-An image that moves the modes far, for example in fast motion, gets more evaluations. It is
-surprising if
+An image that moves the modes far, for example in fast motion, is surprising, and gets more
+evaluations. The condition is
 
     m' P m  >  `SURPRISING_RATIO` E m' P m  =  `SURPRISING_RATIO` tr(I - P H^-1)
 
-m is the vector from the prediction of the heaviest mode, with the precision P, to its optimum, with
-the Hessian H of the energy; so the covariance of m is P^-1 - H^-1. Its expected size grows with the
-information in the image, and so with the time between two images.
+m is the vector from the prediction of the heaviest mode, with the precision P, to its optimum,
+where the energy has the Hessian H; the covariance of m is therefore P^-1 - H^-1. The expected size
+of m grows with the information in the image, and so with the time between two images.
 """
 
 from __future__ import annotations
@@ -34,18 +34,19 @@ from hmt_ros.tracking.weighting import Continuity
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """Inputs of the proposals and optima of one image.
+    """Inputs of the proposals for an image, and optima found so far.
 
     Attributes:
-        posterior: whose energy is minimised.
-        observation: of the image.
+        posterior: energies of poses, which are minimised.
+        observation: observation of the image.
         states: predicted states of the previous modes.
-        precisions: (K, d, d) inverse covariances of their poses.
+        precisions: (K, d, d) inverse covariances of the predicted poses.
         continuity: transition densities from the previous modes.
         plan: allocation of the evaluations of the image.
-        modes: of the previous image.
+        modes: modes of the previous image.
         prediction: pose hypotheses from an external predictor, if any.
-        base: optima in the image, one for each mode, then that of the pose by keypoints, if any.
+        base: optima in the image, one for each mode, then one for the pose fitted to keypoints, if
+            any.
     """
 
     posterior: Posterior
@@ -65,19 +66,19 @@ class Search:
 
     @cached_property
     def base_joints(self) -> Array:
-        """Joints (K, J, 3) of the optima, m."""
+        """Joints (K, J, 3) of the optima `base`, m."""
         return self.posterior.body.joint_positions(self.base.x)
 
     @cached_property
     def base_rated(self) -> Array:
-        """Approximate log weights (K,) of the optima."""
+        """Approximate log weights (K,) of the optima `base`."""
         return self._rated(self.base_joints, self.base.value)
 
     def _rated(self, joints: Array, energies: Array) -> Array:
         return self.continuity.rated(joints) - ERRORS['image'].share(self.dt) * energies
 
     def best(self, poses: Array, energies: Array) -> Index:
-        """Rows of representative poses among (N, d) with energies (N,), at most `candidates`."""
+        """Rows of at most `candidates` representatives of poses (N, d) with energies (N,)."""
         joints = self.posterior.body.joint_positions(poses)
         return choose_hypotheses(
             joints - joints[:, :1],
@@ -87,7 +88,7 @@ class Search:
         ).chosen
 
     def optimise(self, hypotheses: Hypotheses) -> Optimised:
-        """Hypotheses (N, d) at their optima."""
+        """Moves hypotheses (N, d) to their optima."""
         posterior = self.posterior
         # The precision of variables that jumped is lower.
         own = self.states.precisions_of(hypotheses.ancestors, hypotheses.jumped, self.precisions)
@@ -96,18 +97,18 @@ class Search:
         return Optimised(hypotheses, solved)
 
     def evidence(self, optimised: Optimised) -> Array:
-        """Energies (N,) of the image that reduce the log weights, nats."""
+        """Energies (N,) of the image, to subtract from the log weights, nats."""
         exchanges = optimised.hypotheses.exchanges
         return self.posterior.evidence(optimised.minima.x, self.observation, exchanges, self.dt)
 
 
 def is_surprising(moved: Array, precision: Array, hessian: Array) -> bool:
-    """Whether an image has moved a mode far, relative to its information.
+    """Whether an image has moved a mode far, relative to the information in the image.
 
     Args:
-        moved: (d,) from the prediction of the mode to its optimum.
-        precision: (d, d) of the prediction.
-        hessian: (d, d) of the energy, motion prior included, at the optimum.
+        moved: (d,) vector from the prediction of the mode to its optimum.
+        precision: (d, d) precision of the prediction.
+        hessian: (d, d) Hessian of the energy at the optimum, including the motion prior.
     """
     expected = len(moved) - np.trace(solve(hessian, precision))
     return bool(product(product(moved, precision), moved) > SURPRISING_RATIO * max(expected, 1.0))

@@ -1,18 +1,17 @@
-"""The point estimate: the pose whose joints are nearest to those of the modes.
+"""Point estimate: the pose with the least expected joint distance from the modes.
 
     x = argmin sum_k w_k sum_j |p_j(x) - p_j(x_k)|     over the modes that face the likelier way (1)
 
-with joints p_j relative to the pelvis. This is the pose of least expected distance: where modes
-disagree it is a median, which few wrong modes hardly move, and where they agree a mean, which
-has less jitter than each of them. It is found by reweighted least squares, from the weighted mean
-of the poses [Weiszfeld 1937]:
+with joints p_j relative to the pelvis. If modes disagree, this is a median, which a few wrong modes
+hardly move; if they agree, it is a mean, which has less jitter than each mode. Reweighted least
+squares find it, starting at the weighted mean of the poses [Weiszfeld 1937]:
 
     s_kj = w_k / max(|p_j - p_kj|, e),   S_j = sum_k s_kj,   t_j = sum_k s_kj p_kj / S_j         (2)
     x <- x + (sum_j S_j (P_j' P_j + l^2))^-1 sum_j S_j P_j' (t_j - p_j),   P_j = dp_j / dx       (3)
 
-The place of the pelvis is the weighted mean, and so is every variable that moves no joint. Modes
-that face the other way are left out, because the mean of two opposite poses is no human pose. Other
-images are not used: the modes are filtered, and a second filter would lag.
+The position of the pelvis and all variables that move no joint are weighted means. Modes that face
+the other way are left out, because the mean of two opposite poses is no human pose. Other images
+are not used: the modes are already filtered, and a second filter would add a delay.
 """
 
 from __future__ import annotations
@@ -25,21 +24,21 @@ from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.inference.linear_algebra import product, solve
 from hmt_ros.inference.mixture import GaussianMixture
 
-# Number of steps (3): more hardly change the result. Chosen by accuracy on tracked clips.
+# Number of steps (3); more steps hardly change the result. Chosen by accuracy on tracked clips.
 STEPS = 2
-# Distance e of joints below which modes agree, m: the size of their jitter. Chosen by accuracy on
+# Distance e of joints below which modes agree, m: the amplitude of jitter. Chosen by accuracy on
 # tracked clips.
 AGREED = 0.03
-# Lever l of the joints about an axis below which its angle stays that of the mean, m. Chosen.
+# Lever l of joints about an axis below which the angle stays at the weighted mean, m. Chosen.
 LEVER = 0.01
 
 
 def point_estimate(body: Body, posterior: GaussianMixture) -> Array:
-    """The pose (d,) of least expected distance, empty without components.
+    """Pose (d,) with the least expected joint distance; empty without components.
 
     Args:
-        body: of the poses.
-        posterior: over the poses.
+        body: body of the poses.
+        posterior: mixture over the poses.
     """
     if not len(posterior):
         return np.empty(0)
@@ -56,7 +55,7 @@ def point_estimate(body: Body, posterior: GaussianMixture) -> Array:
 
 
 def _facing_alike(body: Body, posterior: GaussianMixture) -> Mask:
-    """The components (K,) that face the likelier way, within 90 degrees of its heaviest one."""
+    """Selects the components (K,) that face the likelier of two opposite ways."""
     weights = posterior.weights
     if not body.trunk_pairs:
         return np.ones(len(weights), dtype=np.bool_)
@@ -67,7 +66,7 @@ def _facing_alike(body: Body, posterior: GaussianMixture) -> Mask:
 
 
 def _step(body: Body, pose: Array, places: Array, weights: Array) -> Array:
-    """The step (3) from a pose (d,), by the joints (K, J, 3) of the modes and their weights."""
+    """Step (3) from a pose (d,), given joints (K, J, 3) and weights (K,) of the modes."""
     now, jacobian = body.relative_joints(pose[None])[0], body.joint_jacobians(pose[None])[0]
     offsets = places - now
     away = np.sqrt((offsets * offsets).sum(2))
@@ -81,7 +80,7 @@ def _step(body: Body, pose: Array, places: Array, weights: Array) -> Array:
 
 
 def _differences(body: Body, poses: Array, reference: Array) -> Array:
-    """Poses (N, d) minus a reference pose (d,), with root rotations in [-pi, pi)."""
+    """Differences of poses (N, d) from a reference (d,), with root rotations in [-pi, pi)."""
     result = poses - reference
     root = root_rotation_dofs(body.skeleton)
     result[:, root] = (result[:, root] + np.pi) % (2.0 * np.pi) - np.pi

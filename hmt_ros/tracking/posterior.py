@@ -1,10 +1,10 @@
-"""The energy of a pose given one image and the expected pose (KJS 2).
+"""Energy of a pose given one image and the expected pose (KJS 2).
 
     E(x) = E_image(x) + E_keypoints(x) + E_prior(x) + E_intersection(x) + E_motion(x)
            + E_ground(x) + E_extra(x)
 
-E_motion is the energy of a Gaussian around the expected pose. E_ground are the terms of gravity,
-floor and feet (`body.ground_terms`), E_extra terms that the user of a tracker adds.
+E_motion is the energy of a Gaussian around the expected pose, E_ground the sum of the terms of
+gravity, floor and feet (`body.ground_terms`), and E_extra the sum of the terms that a user adds.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from hmt_ros.tracking.classes import known_exchanges
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.settings import LIMIT_SIGMA, MAX_SIGMA, MINIMUM_TOLERANCE, TrackerSettings
 
-# Share of a Hessian that is not split by cue.
+# Weight of a Hessian that is not split by cue.
 ALONE = np.ones(1)
-# Precisions of a variable that rests on a limit, and of an unknown variable.
+# Precisions of a variable on a limit, and of an unknown variable.
 PRECISIONS = 1.0 / LIMIT_SIGMA**2, 1.0 / MAX_SIGMA**2
 
 
@@ -42,13 +42,15 @@ class ImageFit:
     """Fit of poses (K, d) to an image, without the motion prior.
 
     Attributes:
-        energy: of all terms, the priors of the body included.
-        image_energy: (K,) of the image and the keypoints alone.
-        hessians: (K, 3, d, d) of the image terms, of the keypoints, and of all other terms.
-        outline_costs: (K, M) of the samples of the silhouette's outline.
-        free: (K, d) variables that do not rest on a limit.
-        covariances: (K, d, d) inverse Hessians of the energy on these; see `free_covariances`.
-        log_determinants: (K,) of the covariances.
+        energy: energy of all terms, including the priors of the body.
+        image_energy: (K,) energies of the image and the keypoints alone.
+        hessians: (K, 3, d, d) Hessians of the image terms, of the keypoints, and of all other
+            terms.
+        outline_costs: (K, M) energies of the samples of the silhouette's outline.
+        free: (K, d) False for variables that rest on a limit.
+        covariances: (K, d, d) inverse Hessians of the energy on the free variables; see
+            `free_covariances`.
+        log_determinants: (K,) log determinants of the covariances.
     """
 
     energy: Energy
@@ -63,17 +65,17 @@ class ImageFit:
     def given_way(self) -> tuple[Array, Array]:
         """Gradients (K, d) and inverse Hessians (K, d, d) of the energy on the free variables.
 
-        Both are 0 for variables that rest on a limit.
+        Both are 0 for variables that are not free.
         """
         gradient = self.energy.derivatives()[0]
         moving = self.free[:, :, None] & self.free[:, None, :]
         return gradient * self.free, self.covariances * moving
 
     def lasting(self, free: Mask, dt: float) -> Array:
-        """Covariances (K, d, d) given one image alone, with persistent errors.
+        """Covariances (K, d, d) given one image alone, for errors that persist over images.
 
         Args:
-            free: (K, d) variables that do not rest on a limit.
+            free: (K, d) whether each variable is free, see `ImageFit`.
             dt: time since the previous image, s.
         """
         shares = np.array([ERRORS['image'].share(dt), ERRORS['keypoints'].share(dt), 1.0])
@@ -81,19 +83,20 @@ class ImageFit:
 
 
 class Posterior:
-    """Energies of poses of one body before one camera, and their minima.
+    """Energies of poses of a body that a camera sees, and their minima.
 
     Args:
-        body, camera: the person, and the camera that sees the person.
-        settings: of the tracker.
-        extra: further terms.
+        body, camera: body of the person, and camera.
+        settings: settings of the tracker.
+        extra: further energy terms.
         ground: gravity and floor; None: not used.
-        spent: list that receives the numbers of evaluations of the likelihood; None: a new list.
+        spent: list to which numbers of evaluations of the likelihood are appended; None: a new
+            list.
 
     Attributes:
-        person: the body, with its prior of the root's lean.
-        body: the same without that prior if the ground terms replace it.
-        camera, settings, extra, ground, spent: as above.
+        person: body with its prior on the root's lean.
+        body: body without the prior on the root's lean if the ground terms replace it.
+        camera, settings, extra, ground, spent: the arguments.
     """
 
     def __init__(
@@ -117,13 +120,13 @@ class Posterior:
 
     @cached_property
     def likelihood(self) -> ImageLikelihood:
-        """The likelihood of images."""
+        """Likelihood of images."""
         s = self.settings
         return ImageLikelihood(self.body, self.camera, s.likelihood, threads=s.threads)
 
     @cached_property
     def divided(self) -> dict[str, tuple[ImageLikelihood, ImageLikelihood]]:
-        """By limb the likelihoods of its flesh, and of the rest of the body."""
+        """For each limb, the likelihood of its flesh and that of the rest of the body."""
         chains, parts = self.body.skeleton.chains, self.body.flesh.parts
         result = {}
         for chain in (chain for pair in self.body.chain_pairs for chain in pair):
@@ -139,12 +142,12 @@ class Posterior:
         exchanges: Array | None = None,
         motion: Quadratic | None = None,
     ) -> PoseEnergy:
-        """The energy, which counts its evaluations.
+        """The energy given an image; counts its evaluations.
 
         Args:
-            observation: of the image.
-            exchanges: log probabilities (N, E) of exchanges of sides before the image, NaN where
-                unknown; None: all unknown.
+            observation: observation of the image.
+            exchanges: log probabilities (N, E) that the detector exchanges sides, given earlier
+                images, NaN where unknown; None: all unknown.
             motion: motion prior; None: no motion prior.
         """
         terms = self._terms(observation, exchanges)
@@ -157,7 +160,7 @@ class Posterior:
         share: float = 1.0,
         lifted_share: float = 1.0,
     ) -> tuple[CompiledTerm | FrameTerm, ...]:
-        """All terms; arguments as for `of_image` and `ImageLikelihood.keypoint_term`."""
+        """All energy terms; arguments as in `of_image` and `ImageLikelihood.keypoint_term`."""
         exchanges = (
             None
             if exchanges is None or observation.keypoints is None
@@ -167,7 +170,7 @@ class Posterior:
         return (*seen, *self.likelihood.priors, *self.known(observation))
 
     def known(self, observation: Observation) -> tuple[FrameTerm | GroundTerm, ...]:
-        """Terms besides those of image and body: the extra terms, gravity and floor."""
+        """Terms other than those of image and body: the extra terms, gravity and floor."""
         if self.ground is None:
             return self.extra
         plane, last = self.ground.plane, self._ground_term
@@ -190,9 +193,9 @@ class Posterior:
         return self.of_image(observation, exchanges, Quadratic(centres, precisions))
 
     def placing(self, observation: Observation) -> PoseEnergy | None:
-        """The energy of prior and squared distances to keypoints; None without keypoints.
+        """Energy of the prior and of squared distances to keypoints; None without keypoints.
 
-        A robust kernel would not draw a limb or a person that is far from the keypoints.
+        A robust kernel would not attract limbs that are far from their keypoints.
         """
         if observation.keypoints is None or self.settings.likelihood.keypoints.weight == 0:
             return None
@@ -201,7 +204,7 @@ class Posterior:
         return PoseEnergy(self.likelihood, (squares, self.likelihood.pose_prior))
 
     def minimise(self, term: PoseEnergy, poses: Array, iterations: int) -> Minimum:
-        """Minima from poses (N, d) within the limits of the body."""
+        """Minimises the energy from poses (N, d) within the limits of the body."""
         return term.minimise(
             poses,
             step_scale=self._step_scale,
@@ -211,7 +214,7 @@ class Posterior:
         )
 
     def fit(self, poses: Array, observation: Observation, lifted_share: float = 1.0) -> ImageFit:
-        """Fit of poses (K, d) to an image; `lifted_share` as for `keypoint_term`."""
+        """Evaluates the fit of poses (K, d) to an image; `lifted_share` as in `keypoint_term`."""
         seen = observation.keypoints
         share = 1.0 if seen is None or seen.lifted is None else lifted_share
         last = self._last_fit
@@ -235,15 +238,16 @@ class Posterior:
     def evidence(
         self, poses: Array, observation: Observation, exchanges: Array, dt: float
     ) -> Array:
-        """Energies (N,) of an image, nats, that reduce the log weights of poses (N, d).
+        """Energies (N,) of an image, nats, to subtract from the log weights of poses (N, d).
 
-        The exchange of sides is a chain (`classes`): its prior counts fully, the energies by their
-        shares.
+        Exchanges of sides form a Markov chain (`classes`), so their prior counts fully, while
+        energies count by their shares.
 
         Args:
-            poses: (N, d).
-            observation: of the image.
-            exchanges: (N, E) log probabilities of exchanges of sides, NaN where unknown.
+            poses: (N, d) poses.
+            observation: observation of the image.
+            exchanges: (N, E) log probabilities that the detector exchanges sides, NaN where
+                unknown.
             dt: time since the previous image, s.
         """
         self.spent.append(len(poses))
@@ -254,19 +258,19 @@ class Posterior:
 
 
 def step_scale(body: Body) -> Array:
-    """Length (d,) of a moderate step of each variable, rad or m."""
+    """Typical step (d,) of each variable in the optimisation, rad or m."""
     return np.where(body.skeleton.dof_is_rotation, 0.3, 0.2)
 
 
 def free_covariances(hessians: Array, free: Mask, shares: Array = ALONE) -> tuple[Array, Array]:
     """Inverses (K, d, d) of sums of Hessians on the free variables, and log determinants (K,).
 
-    A variable at its limit has the deviation `LIMIT_SIGMA`; no deviation exceeds `MAX_SIGMA`.
+    A variable on its limit has the standard deviation `LIMIT_SIGMA`; the maximum is `MAX_SIGMA`.
 
     Args:
-        hessians: (K, C, d, d), one of each cue.
-        free: (K, d).
-        shares: (C,) of the cues.
+        hessians: (K, C, d, d) Hessians of the C cues.
+        free: (K, d) whether each variable is free, see `ImageFit`.
+        shares: (C,) weights of the cues.
     """
     result, log_determinants = np.empty_like(hessians[:, 0]), np.empty(len(hessians))
     hessians = np.ascontiguousarray(hessians, dtype=np.float64)

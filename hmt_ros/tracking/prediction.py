@@ -1,9 +1,9 @@
-"""Predict: the expected hypotheses in the next image (KJS figure 4, step 1).
+"""Predict: expected hypotheses in the next image (KJS figure 4, step 1).
 
     (x, v)_{t+1} ~ N(A (x, v)_t, A S_t A' + Q)
 
-v is the velocity of the mode; A and Q are those of the motion prior (`motion_prior`).
-The optical flow then corrects the means, before shapes are compared.
+v is the velocity of the mode; the motion prior gives A and Q (`motion_prior`). The optical flow
+then corrects the means, before the image terms are evaluated.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from hmt_ros.tracking.posterior import Posterior
 
 
 def dynamics_of(body: Body, motion: str) -> LinearGaussianDynamics:
-    """The dynamics of the poses of a body, by the setting `motion`."""
+    """Dynamics of a body's poses, selected by the setting `motion`."""
     learned = motion == 'learned'
     return motion_prior(body) if learned else LinearGaussianDynamics.random_walk(body.rates)
 
@@ -38,12 +38,12 @@ def dynamics_of(body: Body, motion: str) -> LinearGaussianDynamics:
 def predict(
     modes: Modes, body: Body, dynamics: LinearGaussianDynamics, dt: float
 ) -> tuple[Hypotheses, PredictedStates]:
-    """Hypotheses that the modes predict, within the limits, and their states.
+    """Predicts hypotheses, within the limits, and their states, from modes.
 
     Args:
-        modes: that were selected in the last image.
-        body: with the limits, and the rates of variables that jump.
-        dynamics: of the modes.
+        modes: modes of the last image.
+        body: body with the limits, and the rates of variables that jump.
+        dynamics: dynamics of the modes.
         dt: time since the last image, s.
     """
     states = predicted_states(modes, modes.state_covariances, body, dynamics, dt)
@@ -55,7 +55,7 @@ def predict(
 def predicted_states(
     modes: Modes, covariances: Array, body: Body, dynamics: LinearGaussianDynamics, dt: float
 ) -> PredictedStates:
-    """States of modes with covariances (K, n, n) after dt seconds."""
+    """Predicts the states of modes with covariances (K, n, n) dt seconds ahead."""
     known = np.concatenate([modes.poses, modes.velocities], axis=1)
     means = np.ascontiguousarray(known[:, : dynamics.state_dimension])
     has_velocities = dynamics.state_dimension > dynamics.dimension
@@ -65,13 +65,13 @@ def predicted_states(
 
 @dataclass(frozen=True, eq=False)
 class Forecaster:
-    """Predicts a track from one image on; immutable, so any thread may use it.
+    """Predicts a track after an image; immutable and therefore thread-safe.
 
     Attributes:
         modes: published modes of that image.
-        body: with the limits.
-        motion: the setting.
-        stamp_ns: of the image.
+        body: body with the limits.
+        motion: value of the setting `motion`.
+        stamp_ns: timestamp of the image.
     """
 
     modes: Modes
@@ -80,10 +80,10 @@ class Forecaster:
     stamp_ns: int
 
     def at(self, stamp_ns: int) -> GaussianMixture:
-        """The mixture over poses at a later time, without any image in between.
+        """Predicts the mixture over poses at a later time, without images in between.
 
         Raises:
-            ValueError: the time is before the image.
+            ValueError: the time is earlier than the image.
         """
         if stamp_ns < self.stamp_ns:
             raise ValueError(
@@ -107,14 +107,14 @@ def follow_flow(
     observation: Observation,
     posterior: Posterior,
 ) -> Hypotheses:
-    """Predictions corrected by the optical flow.
+    """Corrects predictions by the optical flow.
 
     Args:
-        predicted: K of them.
-        precisions: (K, d, d) of the predictions.
+        predicted: K predicted hypotheses.
+        precisions: (K, d, d) precisions of the predictions.
         points: visible points of each mode in the last image; None: unknown.
-        observation: of the image.
-        posterior: of the body.
+        observation: observation of the image.
+        posterior: energies of poses of the body.
     """
     s = posterior.settings
     if observation.flow is None or points is None:

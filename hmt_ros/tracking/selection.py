@@ -2,10 +2,10 @@
 
     min over S, |S| = K:   sum_i w_i min_{s in S} d(i, s)
 
-The K heaviest modes would be near copies of the heaviest one. Instead, K hypotheses are chosen
+The K heaviest hypotheses would be near copies of the heaviest. Instead, K hypotheses are chosen
 greedily, heaviest first, to minimise the expected distance from a hypothesis to the nearest kept
-one; d is the mean distance of the joints, each capped; two hypotheses closer than a minimum count
-as one. A dropped hypothesis gives its weight to the nearest kept one.
+one. d is the mean of the joint distances, each capped; two hypotheses closer than a minimum are the
+same. A dropped hypothesis adds its weight to the nearest kept one.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from hmt_ros.tracking.settings import MAX_JOINT_DISTANCE
 
 
 class Kept(NamedTuple):
-    """Hypotheses that represent all.
+    """Selected hypotheses, which represent all others.
 
     Attributes:
-        chosen: (K,) indices, in the order of choice.
+        chosen: (K,) indices of the selected hypotheses, in the order of selection.
         owner: (N,) position in `chosen` of the representative of each hypothesis.
-        log_weights: (K,) of the groups.
+        log_weights: (K,) log weights of the groups.
     """
 
     chosen: Index
@@ -43,15 +43,15 @@ def choose_hypotheses(
     cap: float = MAX_JOINT_DISTANCE,
     first: Sequence[int] = (),
 ) -> Kept:
-    """The hypotheses to keep.
+    """Selects the hypotheses to keep.
 
     Args:
         joints: (N, J, 3) positions for the distances, m.
-        log_weights: (N,).
+        log_weights: (N,) log weights.
         count: maximum number of kept hypotheses, K.
-        same: mean distance below which two hypotheses are one, m.
-        cap: maximum distance of a joint, m.
-        first: hypotheses that are always kept, after the heaviest.
+        same: mean distance below which two hypotheses are the same, m.
+        cap: distance of a joint at which it is capped, m.
+        first: indices of hypotheses that are always kept, after the heaviest.
     """
     n = len(log_weights)
     most = min(count, n)
@@ -74,8 +74,8 @@ def distinct_hypotheses(joints: Array, log_weights: Array, same: float) -> Index
 
     Args:
         joints: (N, J, 3) positions for the distances, m.
-        log_weights: (N,).
-        same: mean distance below which two hypotheses are one, m.
+        log_weights: (N,) log weights.
+        same: mean distance below which two hypotheses are the same, m.
     """
     order, kept = np.argsort(-log_weights, kind='stable'), np.empty(len(joints), dtype=np.intp)
     count = keep_apart(np.ascontiguousarray(joints, dtype=np.float64), order, same, kept)

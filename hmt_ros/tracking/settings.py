@@ -1,9 +1,9 @@
-"""How poses are tracked: the settings of a tracker, and the numbers of its model.
+"""Settings of a tracker, and constants of its model.
 
-Users choose the settings; the other numbers are constants. Each has its unit and its source:
-`Physical` follows from people or from sensors, `Chosen` was set by hand, by tracked clips. Numbers
-of a concept of a lower layer are defined there: the person in `body`, silhouettes, colours and
-keypoints in `image`, errors of cues in `inference.error_model`.
+Users choose the settings. Each constant has its unit and its source: `Physical` constants are
+properties of people or sensors, `Chosen` ones were tuned by hand on tracked clips. Constants of
+lower layers are defined there: of the person in `body`, of silhouettes, colours and keypoints in
+`image`, of errors of cues in `inference.error_model`.
 """
 
 from __future__ import annotations
@@ -22,105 +22,103 @@ MOTIONS = ('learned', 'random_walk')
 
 # --- Search
 
-# Number of evaluations per image above which more hardly help. Chosen by accuracy on tracked clips.
+# Number of evaluations per image above which accuracy hardly improves. Chosen on tracked clips.
 ACCURATE_BUDGET = 400
-# Ratio of the squared motion of the heaviest mode to the expected one above which an image is
-# surprising: the motion prior is wider than most motions. Chosen.
+# Ratio of actual to expected squared motion of the heaviest mode above which an image is
+# surprising; below 1, because the motion prior is wider than most motions. Chosen.
 SURPRISING_RATIO = 0.3
 # Factor on the budget of a surprising image. Chosen.
 SURPRISING_FACTOR = 4
-# Distance of joints up to which two trunks, and two configurations of a limb, are the same, m.
+# Distances of joints below which two trunks, and two configurations of a limb, are the same, m.
 # Chosen.
 SAME_TRUNK_DISTANCE, SAME_LIMB_DISTANCE = 0.06, 0.08
-# Degrees of freedom of the Student prior that keeps a limb near its prediction. Chosen.
+# Degrees of freedom of the Student prior around the prediction of a limb. Chosen.
 LIMB_TAILS = 4.0
-# Factor on the deviations of the body's prior where configurations of a limb are drawn from it.
-# Chosen.
+# Factor on the standard deviations of the body's prior for drawing limb configurations. Chosen.
 PRIOR_STRETCH = 1.3
 # Maximum distance of a joint in the selection of hypotheses, m. Chosen.
 MAX_JOINT_DISTANCE = 0.3
 
 # --- Weights and modes
 
-# Mean squared distance by which joints leave their prediction, m^2/s, and degrees of freedom of its
-# Student tails: modes jitter, and limbs are found in unexpected places. Chosen.
+# Mean squared distance of joints from their prediction, m^2/s, and degrees of freedom of its
+# Student density: modes jitter, and limbs are found in unexpected places. Chosen.
 TRANSITION_SPREAD, TRANSITION_TAILS = 0.01, 2.0
-# c of the probability exp(-c) below which all continuations of a mode lie if it ends, nats. Chosen.
+# Constant c, nats: a mode ends if all its continuations are less likely than exp(-c). Chosen.
 END_NATS = 5.0
-# Largest shift of a mode of the posterior to that of the likelihood, in standard deviations of the
-# posterior: the likelihood alone may be flat. Chosen.
+# Largest shift from a mode of the posterior to that of the likelihood, in standard deviations of
+# the posterior: a likelihood may be flat. Chosen.
 MAX_MODE_SHIFT = 5.0
-# Number of standard deviations above which a measurement is unexplained or a value implausible.
-# Chosen.
+# Standard deviations above which a measurement is unexplained or a value implausible. Chosen.
 GATE_SIGMAS = 4.0
 
 # --- Start of a track
 
-# Standard deviation of a length of the person measured with a tape, m. Physical.
+# Standard deviation of a length measured with a tape, m. Physical.
 MEASURED_SIGMA = 0.01
-# Standard deviation of the place of a person in a given box, as a fraction of the distance. Chosen.
+# Standard deviation of the position of a person in a box, as a fraction of the distance. Chosen.
 BOX_SIGMA = 0.15
 # Number of headings from which a pose is fitted. Chosen.
 HEADINGS = 8
-# Maximum number of poses that a track starts from. Chosen.
+# Maximum number of poses at the start of a track. Chosen.
 MAX_STARTS = 96
-# Distance of some joint from which two starts are distinct, m. Chosen.
+# Distance in some joint above which two starts are distinct, m. Chosen.
 START_DISTANCE = 0.03
 # Time in which a person hardly moves, s. Chosen.
 SAME_MOMENT = 0.2
 
 # --- Shape of the person
 
-# Largest change of the shape by one image, and in total, in standard deviations over people.
+# Largest change of the shape in one image, and in total, in standard deviations over people.
 # Chosen.
 MAX_SHAPE_STEP, MAX_SHAPE_CHANGE = 0.5, 3.0
-# Change of the estimate above which the body, and all that depends on it, is rebuilt, in standard
-# deviations over people (2 mm of a length). Chosen.
+# Change of the shape estimate above which the body and its dependents are rebuilt, in standard
+# deviations over people (2 mm for a length). Chosen.
 REBUILDING_CHANGE = 0.1
-# Largest change of an angle that adapts to a change of the shape, rad. Chosen.
+# Largest change of an angle due to a change of the shape, rad. Chosen.
 MAX_ANGLE_SHIFT = 0.2
 
 # --- Gravity and floor
 
-# Default standard deviation of a given direction of gravity, rad, by the mounting of a camera.
+# Default standard deviation of a given direction of gravity, rad, due to the camera mount.
 # Physical.
 GIVEN_UP_SIGMA = np.radians(2.0)
-# Standard deviation of gravity from the y axis of an image for handheld cameras, rad. Chosen.
-UP_SIGMA = np.radians(15.0)
-# Standard deviation of the axis of a standing body from the vertical, rad, twice as large along the
-# line of sight; lower bound of that of the vertical. Chosen.
-AXIS_SIGMA = np.radians(4.0)
-# Duration of an error of the vertical, by the axis of a body and by the lines of the scene, s.
+# Standard deviation of the angle between gravity and the image's y axis for handheld cameras, rad.
 # Chosen.
+UP_SIGMA = np.radians(15.0)
+# Standard deviation of the angle between the axis of a standing body and the vertical, rad, twice
+# as large along the line of sight; lower bound for the estimated vertical. Chosen.
+AXIS_SIGMA = np.radians(4.0)
+# Correlation time of errors of the vertical from the body's axis or from lines, s. Chosen.
 VERTICAL_TIME = 1.0
 # Drift of the vertical, rad/sqrt(s). Chosen.
 UP_DRIFT = np.radians(1.0)
-# Time window of the lowest sole, s, and the quantile in it that is the floor. Chosen.
+# Time window for the height of the lowest sole, s, and its quantile that is the floor. Chosen.
 LEVEL_TIME, LEVEL_QUANTILE = 2.0, 0.75
-# Standard deviation of the floor from that quantile, m, twice as large by one image. Chosen.
+# Standard deviation of the floor's height from that quantile, m; larger with few images. Chosen.
 LEVEL_SIGMA = 0.04
-# Change of a given direction of gravity above the noise of a sensor, so that the camera turns, rad.
+# Change of the given direction of gravity, above sensor noise, that shows a turning camera, rad.
 # Physical.
 TURN_NOISE = 0.003
-# Number of images with a person head down, weighted by the cosine between trunk and vertical, after
-# which a given vertical that points up in the image is reversed: handstands are shorter. Chosen.
+# Number of images with a person head down after which a given vertical that points up in the image
+# is reversed: handstands are shorter. Each counts by the cosine of trunk and vertical. Chosen.
 HEAD_DOWN_IMAGES = 30.0
 # Prior log odds for the given vertical of a nearly upright camera, nats, and bound on the evidence
-# of a lying person against it: some people do lie. Chosen.
+# against it from a person's axis, because some people do lie down. Chosen.
 RIGHT_VERTICAL_NATS = 3.5
-# Largest log odds by one look at the lines of the scene, nats. Chosen.
+# Largest log odds from one look at the lines of the scene, nats. Chosen.
 LOOK_NATS = 2.0
-# Concentration about the vertical of the axes of people who do not lie. Chosen.
+# Concentration about the vertical of the axes of people who are not lying down. Chosen.
 UPRIGHT_CONCENTRATION = 8.0
 
 # --- Camera and appearance
 
 # Maximum time for which the last known motion of the camera is extrapolated, s. Chosen.
 MAX_EXTRAPOLATION_TIME = 0.5
-# Fraction of an image, or of a person, above which it is most of it.
+# Fraction that counts as most of an image or of a person.
 MAJORITY = 0.5
 # Fraction of the usual value at which a silhouette is no evidence; 0 is full evidence of absence,
-# twice this fraction full evidence of presence. Chosen.
+# and twice this fraction is full evidence of presence. Chosen.
 UNDECIDED_FRACTION = 0.25
 
 
@@ -144,27 +142,25 @@ class LimbSearchSettings:
 
 @dataclass(frozen=True)
 class EvaluationPlan:
-    """Sizes of the search in an image, in evaluations, so that results do not depend on speed.
+    """Allocation of an image's evaluations; counted, not timed, so that results are repeatable.
 
         budget B    predictions descend    limbs and trunks are rated    candidates descend
         share       about B / 8            at most 2 B / 3                about B / 5
 
-    If limbs are searched for as well, at most 2 B / 5 are rated. The rest is for covariances and
-    shape of the modes and for the likelihood alone. Settings bound each part; a smaller budget
-    reduces all parts.
+    If limbs are searched too, at most 2 B / 5 are rated. The rest is for covariances and shape of
+    the modes, and for the likelihood. Settings bound each part; a smaller budget reduces all parts.
 
     Attributes:
         hypotheses: maximum number of modes that are kept, K.
         candidates: maximum number of hypotheses that are fully optimised.
-        iterations: number of Newton steps on the predictions, and on the candidates.
-        groups: maximum number of searched groups of modes, each with a common trunk.
-        rated: maximum number of poses that are rated, all groups together, if limbs are searched
-            for.
-        rated_alone: the same without limb search.
-        alternatives: maximum number of configurations of a limb.
-        combinations: maximum number of combinations on each trunk.
-        searched_chains: number of limbs searched in each group.
-        samples, refined: numbers of samples of a limb, and of the best ones that are refined.
+        iterations: maximum number of Newton steps, for predictions and for candidates.
+        groups: maximum number of groups of modes with a common trunk that are searched.
+        rated: maximum number of rated poses in all groups, if limbs are searched.
+        rated_alone: maximum number of rated poses in all groups, if no limb is searched.
+        alternatives: maximum number of configurations per limb.
+        combinations: maximum number of combinations of limb configurations on each trunk.
+        searched_chains: maximum number of limbs searched in each group.
+        samples, refined: number of samples per limb, and number of the best that are refined.
         surprising: whether the image is surprising.
     """
 
@@ -187,9 +183,9 @@ class TrackerSettings:
     """How poses are tracked.
 
     Attributes:
-        evaluation_budget: Number of evaluations of poses that an image may take, about: 400 is
-            accurate, 300 is nearly so, and with fewer quality falls step by step.
-        max_hypotheses: Maximum number of modes that are kept, K.
+        evaluation_budget: Approximate number of pose evaluations per image; 400 is accurate, 300
+            nearly so, and with fewer accuracy falls gradually.
+        max_hypotheses: Maximum number K of modes that are kept.
         hypothesis_merge_distance: Mean distance of the joints below which two modes are merged, m.
         proposals: Proposal distribution: 'kjs' (kinematic jumps and covariance-scaled samples),
             'css' (covariance-scaled samples alone) or 'ss' (spherical samples alone); the names
@@ -208,12 +204,11 @@ class TrackerSettings:
             corrects predictions; 0 switches it off.
         least_log_weight: Smallest log weight of a mode that is kept, nats.
         estimate_shape: Whether lengths and flesh of the person are estimated while the track lasts.
-        lifter: Experts that tell from the keypoints of the last images how deep the joints are:
-            'keypoints', which ships, or a file that 'learn lifter' wrote; if empty, keypoints count
-            by themselves.
-        threads: Number of threads that share the poses of an image; 0 takes one a core, 8 at most,
-            and leaves one core to others.
-            Results do not depend on it.
+        lifter: Experts that estimate the depth of joints from the keypoints of the last images:
+            'keypoints' (shipped) or a file written by 'learn lifter'; if empty, keypoints are used
+            without lifting.
+        threads: Number of threads that share the poses of an image; 0 selects one per core, at most
+            8, and leaves one core free. Results do not depend on it.
         likelihood: settings of the likelihood.
         search: settings of the search of limbs.
         ground: settings of what is known of gravity and floor.
@@ -296,66 +291,65 @@ class TrackerSettings:
 
 # --- Beliefs of a track
 
-# Rates at which the second state of two-state chains begins and ends, 1/s.
+# Transition rates into and out of the second state of two-state chains, 1/s.
 RATES: Mapping[str, tuple[float, float]] = MappingProxyType(
     {
         # A person enters an empty view, and leaves it. Chosen.
         'existence': (0.1, 0.2),
-        # Unseen, another person replaces the last one once in an hour. Chosen.
+        # Another person replaces the unseen one once in an hour. Chosen.
         'same person': (0.0, 1.0 / 3600.0),
-        # A track or a cue recovers, and fails. Chosen.
+        # A track or a cue recovers from a failure, and fails. Chosen.
         'track and cues': (1.0, 0.05),
-        # A detector as a whole returns to the person, and turns to another. Chosen.
+        # A detector returns to the person, and switches to another person. Chosen.
         'detector': (1.0, 0.02),
     }
 )
-# Largest log likelihood ratio of somebody against nobody in an image, nats, and duration of its
-# errors, s. A clear image is wrong in 1 of 3,000 cases, by a persistent cause outside the model. A
-# detector misses a badly visible person in about 1 of 100 images, for longer. Chosen.
+# Largest log likelihood ratio of somebody against nobody from an image, nats, and correlation time
+# of its errors, s. A clear image is wrong in 1 of 3,000 cases, from a persistent cause outside the
+# model. A detector misses a badly visible person in about 1 of 100 images, for longer. Chosen.
 EXISTENCE_CUES: Mapping[str, tuple[float, float]] = MappingProxyType(
     {'clear': (8.0, 0.2), 'doubtful': (5.0, 0.25)}
 )
-# Probabilities of existence above which somebody is present, so that a new track may start, and
-# below which nobody is, if the image is evidence of that. Between them it is undecided. Chosen.
+# Probabilities of existence above which a person is present and a new track may start, and below
+# which nobody is present, if the image supports it. Chosen.
 PRESENT_PROBABILITY, ABSENT_PROBABILITY = 0.85, 0.03
-# Weight of the cue of a silhouette that a side of the image may cut, and of keypoints of a part of
-# a person. Chosen.
+# Weight of a silhouette that the image border may cut, and of keypoints of a part of a person.
+# Chosen.
 PART_FRACTION = 0.6
-# Difference in evidence between a wholly explained cue and an unexplained one, nats, and the number
-# of measurements that suffices for it: neighbours have common errors. Chosen.
+# Difference in evidence between a fully explained cue and an unexplained one, nats, and number of
+# measurements for full evidence: neighbours have common errors. Chosen.
 VALIDITY_NATS, VALIDITY_COUNT = 16.0, 4
-# Duration of misfits of the modes to a cue, s. Chosen.
+# Correlation time of misfits of the modes to a cue, s. Chosen.
 MISFIT_TIME = 0.1
-# Maximum evidence of one image about a cue, nats: it may be wrong in unforeseen ways. Chosen.
+# Maximum evidence from one image about a cue, nats, because of unmodelled errors. Chosen.
 MAX_CUE_NATS = 3.5
-# Probability that a mode has the right place of a part of the body: limbs lag behind, and are hard
-# to see in front of the trunk. Chosen.
+# Probability that a mode places a body part correctly: limbs lag behind, and are hard to see in
+# front of the trunk. Chosen.
 PLACED_PROBABILITY = 0.8
 # Probability that the evidence of an image for a facing direction is about the person. Chosen.
 FACING_VALID = 0.9
-# Largest log odds of a facing direction, nats, also of the only one that a start has. Chosen.
+# Largest log odds of a facing direction, nats, also used if a start has only one. Chosen.
 MAX_FACING_NATS = 10.0
 # Least probability of an exchange of sides by a detector. Chosen.
 LEAST_EXCHANGE = 1e-6
-# Difference in log weight to the heaviest mode up to which a mode is likely, nats. Chosen.
+# Largest difference in log weight between the heaviest mode and a likely one, nats. Chosen.
 LIKELY_NATS = 4.0
 # Probability that a person stands on both feet if contact is unknown. Chosen.
 RESTING_SHARE = 0.3
 
 # --- Modes
 
-# Reduction of the energy by a step below which a minimisation stops, nats. Chosen.
+# Decrease of the energy per step below which a minimisation stops, nats. Chosen.
 MINIMUM_TOLERANCE = 0.02
-# Largest standard deviation of a variable of a mode, without evidence, and that of a variable on
-# its limit (3 degrees), rad or m. Chosen.
+# Standard deviations of a variable of a mode, rad or m: maximum, without evidence, and on a limit
+# (3 degrees). Chosen.
 MAX_SIGMA, LIMIT_SIGMA = 2.0, 0.05
-# Number of fits of the shape to the first image, and number of the heaviest modes that the shape is
-# estimated from. Chosen.
+# Number of shape fits to the first image, and number of heaviest modes for the shape. Chosen.
 FIRST_SHAPE_FITS, SHAPE_MODES = 3, 4
-# Largest distance of a person from the prediction, m, and its growth with time, m/s: keypoints
+# Largest distance of a person from the prediction, m, and its growth with time, m/s; keypoints
 # further away belong to another person. No clip reaches it.
 BODY_REACH, BODY_SPEED = 0.1, 4.0
-# Newton steps from the reversal of a mode to its optimum, before candidates are compared. Chosen.
+# Number of Newton steps for a reversed mode before it is compared with candidates. Chosen.
 REVERSAL_ITERATIONS = 8
-# Number of bits of an identity below those for the posture of unseen limbs.
+# Number of low bits of an identity, below the bits for the posture of unseen limbs.
 POSTURE_BITS = 20

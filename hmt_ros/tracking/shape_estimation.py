@@ -1,17 +1,17 @@
-"""The shape of the person, lengths and flesh, estimated over a track.
+"""Estimate of a person's shape, that is lengths and flesh, over a track.
 
     S_k = H_tt - H_tp C_k H_pt,    g_k = h_t - H_tp C_k h_p,    C_k = H_pp^-1            at mode k
     J_k = -C_k H_pt                                                                 dx_k / dtheta
     A = sum tau S,    b = sum tau (S theta - g),    n = sum tau                over images and modes
     P = (P_0^-1 + A / (1 + c n))^-1,    theta = P b / (1 + c n)
 
-theta is the shape (see `body.shape`), x_k the pose of mode k, h and H are gradient and Gauss-Newton
-Hessian of the energy of one image over both. The pose adapts to a wrong shape: the information
-that remains is the Schur complement S. Every image counts with the share tau, because neighbouring
-images have the same errors, and all images together with no more than 1 / c of one
-(`inference.error_model`): clothes, and everything else that the model lacks, are the same in all of
-them, and would finally outweigh the prior over people. Uncertainty of the shape makes the pose
-uncertain: J P J' is added to the covariances of modes (a consider covariance, [Schmidt 1966]).
+theta is the shape (see `body.shape`), x_k the pose of mode k, and h and H are the gradient and the
+Gauss-Newton Hessian of the energy of one image over both. The pose adapts to a wrong shape: the
+remaining information is the Schur complement S. Every image counts with the share tau, because
+neighbouring images have the same errors. All images together count as at most 1 / c images
+(`inference.error_model`), because clothes and other unmodelled effects are the same in all of them,
+and would finally outweigh the prior over people. Uncertainty of the shape makes the pose uncertain:
+J P J' is added to the covariances of modes (a consider covariance, [Schmidt 1966]).
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from hmt_ros.tracking.settings import (
 
 
 class Linearised(NamedTuple):
-    """The energy of an image over shape and pose, to second order, at N poses.
+    """Second-order expansion of the energy of an image over shape and pose, at N poses.
 
     Attributes:
-        by_shape: (N, P) gradient by the shape.
+        by_shape: (N, P) gradient with respect to the shape.
         curvature: (N, P, P) Gauss-Newton Hessian over the shape.
-        mixed: (N, P, d) the same between shape and pose.
+        mixed: (N, P, d) block of the Gauss-Newton Hessian between shape and pose.
     """
 
     by_shape: Array
@@ -55,10 +55,10 @@ class ShapeEstimate:
     """Estimates the shape of one person.
 
     Args:
-        body: initial estimate, with the prior `length_covariance`.
+        body: initial estimate, whose `length_covariance` is the prior of the lengths.
 
     Attributes:
-        covariance: (P, P) of the shape.
+        covariance: (P, P) covariance of the shape.
     """
 
     def __init__(self, body: Body) -> None:
@@ -69,14 +69,14 @@ class ShapeEstimate:
         self._information, self._vector = np.zeros((size, size)), np.zeros(size)
         self._count = 0.0
         self._offset = np.zeros(size)
-        # The offset of the present body, which follows the estimate in steps.
+        # Offset of the present body, which is rebuilt in steps to follow the estimate.
         self._taken = self._offset
         self._seen: Observation | None = None
         self._known: tuple[Array, Linearised] | None = None
 
     @property
     def body(self) -> Body:
-        """The person."""
+        """Body with the estimated shape."""
         return self._space.body
 
     def update(
@@ -90,15 +90,16 @@ class ShapeEstimate:
         *,
         trust: float,
     ) -> Body:
-        """Updates the shape by an image; returns the person's body.
+        """Updates the shape from an image; returns the person's body.
 
         Args:
-            likelihood: of the present body.
-            observation: of the image.
-            poses, weights: (K, d), (K,) modes at the image.
-            gradients: (K, d) of the energy of the image and the body's prior, by the pose.
-            covariances: (K, d, d) inverse Hessians of that energy, 0 for variables on a limit.
-            trust: tau, share of the image.
+            likelihood: likelihood of the present body.
+            observation: observation of the image.
+            poses, weights: poses (K, d) and weights (K,) of the modes in the image.
+            gradients: (K, d) gradients of the energy of image and body prior, with respect to the
+                pose.
+            covariances: (K, d, d) inverse Hessians of the same energy, 0 for variables on a limit.
+            trust: share tau with which the image counts.
         """
         linear = self.linearised(likelihood, observation, poses)
         size, turns = self._space.size, self._space.body.skeleton.dof_is_rotation
@@ -131,9 +132,9 @@ class ShapeEstimate:
         poses: Array,
         covariances: Array,
     ) -> Array:
-        """Covariance of modes due to the uncertain shape: J P J', (K, d, d).
+        """Covariances J P J' (K, d, d) of modes due to the uncertain shape.
 
-        Arguments as for `update`.
+        See `update` for the arguments.
         """
         mixed = self.linearised(likelihood, observation, poses).mixed
         result = np.empty(covariances.shape)
@@ -143,10 +144,10 @@ class ShapeEstimate:
     def linearised(
         self, likelihood: ImageLikelihood, observation: Observation, poses: Array
     ) -> Linearised:
-        """The energy of the contours and keypoints of an image around poses (N, d).
+        """Expands the energy of an image's contours and keypoints around poses (N, d).
 
-        The last result is cached: covariances and shape need the same modes, first all of them and
-        then the best.
+        The last result is cached, because the covariances need all modes and the shape then needs
+        the best of them.
         """
         n = len(poses)
         if self._seen is observation and self._known is not None:

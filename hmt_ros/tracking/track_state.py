@@ -1,16 +1,16 @@
-"""The state of a track beside its modes, and the published estimate.
+"""State of a track other than its modes, and the published estimate.
 
     existence   whether a person is in view                                    `existence`
     validity    whether modes are at the person, and cues show the person      `validity`
     identity    whether the person in view is the one who was seen last        `SAME_PERSON`
 
         WAITING or NOBODY  -> (a start)                         ->  TRACKING
-        TRACKING           -> (no image shows where)            ->  LOST
+        TRACKING           -> (no image locates the person)     ->  LOST
         LOST               -> (found again)                     ->  TRACKING
         TRACKING or LOST   -> (an image shows nobody)           ->  NOBODY
         TRACKING or LOST   -> (not seen for an hour)            ->  WAITING, for anybody
 
-The classes of the modes, which are chains, too, are stored with the modes (`hypotheses.Modes`).
+The classes of the modes are Markov chains, too; the modes store them (`hypotheses.Modes`).
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ from hmt_ros.tracking.prediction import Forecaster
 from hmt_ros.tracking.settings import RATES
 from hmt_ros.tracking.validity import Validity
 
-# Chain of whether the person in view is the one who was seen last.
+# Markov chain for the person in view being the one seen last.
 SAME_PERSON = MarkovChain.of_two(*RATES['same person'])
 
 
 @dataclass
 class TrackState:
-    """The state of a track, or of the wait for one.
+    """State of a track, or of a tracker that waits for a person.
 
     Attributes:
-        existence: whether a person is in view.
-        validity: of the modes and of the cues.
-        ended: whether a track has ended, so that the next person starts another one.
-        met: stamp of the last image that showed the person, ns; None: nobody is known.
-        stamp: of the last image, ns; None: no image yet.
-        followed: stamp of the last image that the modes were fitted to, ns; None: no track.
+        existence: filter of the probability that a person is in view.
+        validity: validity of the modes and of the cues.
+        ended: whether a track has ended, so that the next person starts another track.
+        met: timestamp of the last image that showed the person, ns; None: no person is known.
+        stamp: timestamp of the last image, ns; None: no image yet.
+        followed: timestamp of the last image to which the modes were fitted, ns; None: no track.
     """
 
     existence: Existence = field(default_factory=Existence)
@@ -82,24 +82,24 @@ class TrackState:
 
     @property
     def nobody_shown(self) -> bool:
-        """Whether the last image itself shows that nobody is there, unlike a covered lens."""
+        """Whether the last image shows that nobody is in view, unlike a covered lens."""
         return self.ended and self.existence.nobody
 
     def age(self, stamp: int) -> float:
-        """Time since the last image that the modes were fitted to, s; 0 without a track."""
+        """Time since the last image to which the modes were fitted, s; 0 without a track."""
         return 0.0 if self.followed is None else seconds(stamp - self.followed)
 
     def is_somebody_else(self, stamp: int) -> bool:
-        """Whether the person in view at a stamp, ns, is more likely not the one seen last."""
+        """Whether a person in view at a timestamp, ns, is probably not the one seen last."""
         if self.met is None:
             return False
         return bool(SAME_PERSON.closed(1.0, seconds(stamp - self.met)) < 0.5)
 
     def reason(self, scene: str, misfit: float) -> str:
-        """Text on what is missing in a state other than tracking and nobody; '' if nothing.
+        """Text that explains why no person is tracked; '' if none is needed.
 
         Args:
-            scene: text on what is missing for silhouettes.
+            scene: text that explains why there are no silhouettes.
             misfit: share of the last image that no mode explains.
         """
         status, existence = self.status, self.existence
@@ -123,36 +123,35 @@ class Estimate:
 
     Attributes:
         status: state of the tracker.
-        reason: text on what is missing in a state other than tracking and nobody; '' if nothing.
+        reason: text that explains why no person is tracked; '' if none is needed.
         existence_probability: probability that a person is in view, given all images so far; NaN
             without any evidence.
-        nobody_shown: whether the last image itself shows that nobody is there, unlike a covered
-            lens.
-        started_from: the input that this track began from; None before the first.
-        body: the person, with the present estimate of lengths and flesh.
+        nobody_shown: whether the last image shows that nobody is in view, unlike a covered lens.
+        started_from: input from which the track started; None before the first track.
+        body: body with the present estimate of lengths and flesh.
         modes: propagated modes of the track, heaviest first; empty without a track.
         published: modes of the published posterior, with unseen limbs spread over usual postures.
-        point_estimate: (d,) the pose of least expected distance of the joints from the person's;
+        point_estimate: (d,) pose whose joints have the least expected distance from the person's;
             empty without a track.
-        likelihood: of the last image that was tracked.
-        shown: evidence of the last image, weighted by the beliefs; None if it shows no person.
-        foreseen: whether the last image did not show the person, so that a prediction is published.
+        likelihood: likelihood of the last image in which the person was tracked.
+        shown: evidence from the last image, weighted by the beliefs; None without a fit to it.
+        foreseen: whether a prediction is published, because the last image did not show the person.
         misfit: share of the last image that no mode explains.
         evaluations: number of evaluations of the likelihood in the last image.
         validity: probabilities that the track and each cue of the images are valid.
-        contacts: probability by foot, 'left_foot' and 'right_foot', that the heaviest mode rests on
-            it. Empty if unknown: there is no track, the body has no feet, the ground terms are off,
-            or the motion of the camera is unknown. The camera is fixed if there is a background
-            image, or moves as given by `Tracker.set_camera`.
+        contacts: probability of the heaviest mode resting on each foot, 'left_foot' and
+            'right_foot'. Empty if there is no track, the body has no feet, the ground terms are
+            off, or the motion of the camera is unknown. With a background image the camera is
+            fixed; otherwise `Tracker.set_camera` gives its motion.
         ground: gravity and floor, as far as they are known or estimated.
-        vertical: (3,) unit vector against gravity, camera frame, given or shown by the scene; None:
-            unknown, or only guessed from the track.
-        gravity_contradicted: whether scene or person contradict the given gravity, which is used
-            nevertheless.
-        gravity_reversed: whether the opposite of the given gravity is used, because it has the sign
-            of an accelerometer.
-        motion: the setting.
-        stamp_ns: of the last image that the modes were fitted to; None: there is no track.
+        vertical: (3,) unit vector against gravity, camera frame, given or shown by the scene; None
+            if unknown, or only guessed from the track.
+        gravity_contradicted: whether scene or person contradict the given gravity; it is used
+            anyway.
+        gravity_reversed: whether the given gravity is used with the opposite sign, because it has
+            the sign of an accelerometer.
+        motion: value of the setting `motion`.
+        stamp_ns: timestamp of the last image to which the modes were fitted; None: no track.
     """
 
     status: Status
@@ -180,14 +179,14 @@ class Estimate:
 
     @property
     def posterior(self) -> GaussianMixture:
-        """The posterior over poses, without components if there is no track."""
+        """Posterior over poses; has no components without a track."""
         return self.published.mixture
 
     @property
     def velocities(self) -> Array | None:
         """Velocities (K, d) of the published modes, per second; None if unknown.
 
-        They are unknown in the first image of a track, and with the random walk.
+        Velocities are unknown in the first image of a track, and with a random walk.
         """
         velocities = self.published.velocities
         return velocities if velocities.any() else None
@@ -196,14 +195,14 @@ class Estimate:
     def origins(self) -> Array:
         """Probabilities (K, M) that component k of the posterior continues previous component m.
 
-        M is the number of components of the previous image, 0 where a track starts or restarts; see
+        M is the number of components of the previous image, or 0 if a track starts or restarts; see
         `LaggedWeights`.
         """
         return np.eye(len(self.published)) if self.foreseen else self.published.origins
 
     @property
     def forecaster(self) -> Forecaster:
-        """Predictor of the track from the last image that the modes were fitted to.
+        """Predicts the track from the last image to which the modes were fitted.
 
         Raises:
             ValueError: there is no track.
@@ -214,7 +213,7 @@ class Estimate:
 
 
 def no_likelihood(dimension: int) -> Likelihood:
-    """The empty likelihood over poses of d variables, before the first image."""
+    """Empty likelihood over poses of `dimension` variables, before the first image."""
     square = np.zeros((dimension, dimension))
     nothing = GaussianMixture(np.empty(0), np.empty((0, dimension)), square[None][:0])
     none, nobody = np.empty(0), np.empty(0, dtype=np.intp)

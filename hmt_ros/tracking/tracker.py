@@ -5,7 +5,7 @@
     propagate    the modes to the image, or start or end a track           `MixtureFilter`
     publish      the present estimate                                      `Estimate`
 
-The tracker handles images, background, starts and existence; a `MixtureFilter` holds the person and
+The tracker handles images, background, starts and existence; a `MixtureFilter` stores the body and
 the mixture.
 """
 
@@ -70,19 +70,20 @@ class Tracker:
     Args:
         body: model of the person; a subject's lengths replace the model's when a track starts.
         camera: the calibrated camera.
-        settings: of the tracking.
+        settings: settings of the tracker.
         background: model of the empty scene. If it is None or empty, it is learned from images
             before the track starts; without such images, silhouettes are not used.
-        seed: of all randomness. The same images, settings and seed give the same numbers.
+        seed: random seed. The same images, settings and seed give the same numbers.
         extra: further energy terms of the posterior.
         known_ground: gravity and floor, as far as they are known; the rest is estimated.
-        shared_background: whether several trackers share the background; then none learns it.
+        shared_background: whether several trackers share the background; if so, no tracker learns
+            it.
 
     Attributes:
-        model, camera, settings: as above; the model does not have the lengths of a subject.
+        model, camera, settings: the arguments; the model does not include a subject's lengths.
         silhouettes: source of the silhouettes of the images.
         track_id: number of the present track, or of the last one; 0 before the first.
-        estimate: what is known after the last image.
+        estimate: estimate after the last image.
     """
 
     def __init__(
@@ -105,7 +106,7 @@ class Tracker:
         self._observer = Observer(camera, self.settings, self.silhouettes)
         self._seed = seed
         self._extra = tuple(extra)
-        # The start that the user gave, and the box of the person in the next image.
+        # Start given by the user, and box of the person in the next image.
         self._given: Subject | GaussianMixture | None = None
         self._box: Box | None = None
         self._started_from: Source | None = None
@@ -125,17 +126,17 @@ class Tracker:
     def reset(
         self, start: Subject | GaussianMixture | None = None, *, box: Box | None = None
     ) -> None:
-        """Drops the track; a new one starts.
+        """Drops the track, so that a new one starts.
 
         Args:
-            start: a subject, whose track starts at the first image at or after its stamp, or a
-                mixture over poses of the present body. None repeats the last given start; if
-                there is none, the first keypoints, mask or prediction that suffice start a track.
-            box: (left, top, right, bottom) that contains the person in the next image, px; the
-                track starts there.
+            start: subject, or mixture over poses of the present body. A subject starts the track at
+                the first image at or after its timestamp. None repeats the last given start;
+                without one, the first sufficient keypoints, mask or prediction start a track.
+            box: (left, top, right, bottom) around the person in the next image, px; the track
+                starts in it.
 
         Raises:
-            ValueError: a mixture of another dimension, or a box that is not in the image.
+            ValueError: the mixture has another dimension, or the box is outside the image.
         """
         body = self._track.body
         if isinstance(start, GaussianMixture) and start.dimension != body.dimension:
@@ -170,29 +171,31 @@ class Tracker:
 
         Args:
             image: (H, W, 3) BGR uint8, of the camera's size.
-            stamp: of the image, ns; later than the previous one.
+            stamp: timestamp of the image, ns; later than the previous one.
             keypoints: joints detected in this image. If none of them is seen, the detector saw
                 nobody; None: there is no detector, or it has not answered.
             prediction: poses that a regression predicts from this image, if any. They are
-                hypotheses in every image and in the search for a lost track, and start a track
-                if there is no other start and keypoints do not suffice, with the lengths that
-                they assume. They are no evidence: that would count the image twice.
-            mask: (H, W) pixels of the person by a segmenter; replaces background subtraction. If
-                all are false, the segmenter sees nobody; None: unknown.
-            nobody_predicted: whether that regression saw nobody in this image.
-            others: (H, W) pixels that other people cover or may cover, which are no evidence for
-                or against a pose; None: no such pixels.
+                hypotheses in every image and in the search for a lost track. They also start a
+                track, with the lengths that they assume, if there is no other start and the
+                keypoints do not suffice. They are not evidence, because the image would then be
+                counted twice.
+            mask: (H, W) pixels of the person from a segmenter; replaces background subtraction. All
+                False if the segmenter sees nobody; None: unknown.
+            nobody_predicted: whether the regression saw nobody in this image.
+            others: (H, W) pixels that other people cover or may cover; they are no evidence about
+                the pose. None: no such pixels.
             depth: (H, W) depth at each pixel, along the axis of the camera, m; 0, NaN and values
                 out of range are no evidence. None: unknown.
 
         Returns:
             The posterior p(x_t | R_t) and the likelihood p(r_t | x_t), undiscounted (see
-            `Likelihood.errors`), as mixtures over poses, heaviest first with weights that sum to 1;
-            (None, None) while there is no track: before the first one, or while nobody is in view.
+            `Likelihood.errors`), as mixtures over poses, heaviest component first, with weights
+            that sum to 1; (None, None) without a track, that is before the first one or while
+            nobody is in view.
 
         Raises:
-            ValueError: an image, mask or depth of another size, a stamp that does not increase, or
-                a prediction of a body with other degrees of freedom.
+            ValueError: an image, mask or depth has another size, the timestamp does not increase,
+                or the body of the prediction has other degrees of freedom.
         """
         predicted = False if nobody_predicted else True if prediction is not None else None
         given = View(image, stamp, keypoints, prediction, mask, predicted, others, depth)
@@ -220,7 +223,7 @@ class Tracker:
             up_sigma: standard deviation of the direction about each horizontal axis, rad.
 
         Raises:
-            ValueError: `up` is no unit vector, or the height is not positive.
+            ValueError: `up` is not a unit vector, or the height is not positive.
         """
         self._newer_gravity = KnownGround(unit_vector(up), camera_height, up_sigma)
 
@@ -228,22 +231,22 @@ class Tracker:
         """Sets the pose of the camera for the next image.
 
         Motion, gravity, floor and contacts then refer to the fixed frame, while the mixture stays
-        in the camera frame. Where an image has no pose, the last motion of the camera is
-        extrapolated for at most half a second.
+        in the camera frame. If an image has no pose, the last motion of the camera is extrapolated
+        for at most half a second.
 
         Args:
-            position: (3,) of the camera in a fixed frame with any axes, m.
-            rotation: (3, 3) from the camera optical frame to that frame.
+            position: (3,) position of the camera in a fixed frame with arbitrary axes, m.
+            rotation: (3, 3) rotation from the camera optical frame to the fixed frame.
 
         Raises:
-            ValueError: numbers that are not finite, or no rotation.
+            ValueError: a number is not finite, or `rotation` is not a rotation matrix.
         """
         self._camera_pose = CameraPose.of(position, rotation)
 
     # Observe.
 
     def _move_camera(self, stamp: int) -> None:
-        """Moves the estimates to the camera frame of the next image; applies newer gravity."""
+        """Transforms the estimates to the camera frame of the next image; applies newer gravity."""
         pose, self._camera_pose = self._camera_pose, None
         motion = self._camera_path.advance(stamp, pose)
         if motion is not None:
@@ -258,7 +261,7 @@ class Tracker:
             self.silhouettes.see_from(pose, self.camera)
 
     def _observe(self, given: View) -> View:
-        """Returns the view of an image, after the ground and the scene are updated from it."""
+        """Updates ground and scene from an image, and returns the view of a person in it."""
         ground, silhouettes = self._ground, self.silhouettes
         self._track.spent.clear()
         self._move_camera(given.stamp)
@@ -294,7 +297,7 @@ class Tracker:
         return view
 
     def _lifted(self, keypoints: Keypoints | None, stamp: int) -> Keypoints | None:
-        """Adds to keypoints the mixture over whole poses by experts, or by a 3D detector."""
+        """Adds to keypoints a mixture over whole poses, pooled from experts and a 3D detector."""
         if keypoints is None or not keypoints.seen.any():
             return keypoints
         opinions = []
@@ -323,7 +326,7 @@ class Tracker:
         state.existence.look(view, self._track.person, waiting=not state.begun)
 
     def _judge(self, judged: Judged, depths: ImageMap | None, dt: float) -> None:
-        """Updates the beliefs in modes and cues by an image, dt s after the previous one."""
+        """Updates the validity of modes and cues from an image, dt s after the previous one."""
         validity, track = self._state.validity, self._track
         validity.update(judged.misfits, dt, judged.alone)
         if depths is not None:
@@ -333,7 +336,7 @@ class Tracker:
     # Propagate, start or end.
 
     def _propagate(self, view: View) -> Observation:
-        """Moves the track to an image; returns the observation, weighted by the beliefs."""
+        """Propagates the track to an image; returns the observation, weighted by the beliefs."""
         state, track = self._state, self._track
         if state.existence.last.elsewhere:
             view = self._observer.view(view, track.person, None, 0.0)
@@ -353,7 +356,7 @@ class Tracker:
         return believed
 
     def _search(self, observation: Observation, prediction: PosePrediction | None) -> Array | None:
-        """Poses for a search in the image, see `poses_to_search`; None if missing."""
+        """Poses from which to search the image, or None; see `poses_to_search`."""
         gravity = self._ground.gravity(self.settings.ground.upright_weight)
         return poses_to_search(self._track.person, self.camera, observation, prediction, gravity)
 
@@ -380,12 +383,12 @@ class Tracker:
         return replace(observation, beliefs=state.validity.beliefs)
 
     def _given_start(self, view: View, *, somebody: bool) -> Observation | None:
-        """Starts a track from the given start, or from an image, if it suffices.
+        """Starts a track from the start given by the user, or from a sufficient image.
 
         Args:
-            view: of the image.
-            somebody: whether the existence filter reports a person; if not, the start itself
-                makes one certain.
+            view: view of the image.
+            somebody: whether the existence filter reports a person; if not, the start resets it to
+                `GIVEN`.
         """
         masked, existence, silhouettes = (
             view.mask is not None,
@@ -423,7 +426,7 @@ class Tracker:
             self._begin(observation, source, start)
             if self._state.validity.believes(SILHOUETTE):
                 break
-            # The silhouette contradicts the start, which is right: repeat without silhouette.
+            # The silhouette contradicts the start. The start is trusted: repeat without silhouette.
         if not somebody:
             self._state.existence = Existence(GIVEN)
             self._meet(view)
@@ -441,7 +444,7 @@ class Tracker:
         )
 
     def _drop_track(self, state: TrackState, body: Body | None = None) -> None:
-        """Drops everything but a state and the body, which may be replaced."""
+        """Drops the track; keeps a state, and the body unless another one is given."""
         state.existence.appearance = Appearance()
         self._state = replace(state, validity=Validity(), followed=None)
         self._track = self._new_track(body or self._track.body)
@@ -458,12 +461,12 @@ class Tracker:
         )
 
     def _learn(self, view: View, *, image_counts: bool) -> None:
-        """Updates background, ground, appearance and landmarks by the modes of an image."""
+        """Updates background, ground, appearance and landmarks from the modes of an image."""
         state, track, modes = self._state, self._track, self._track.modes
         shown = {KEYPOINTS: view.keypoints is not None, DEPTH: view.depth is not None}
         told = any(shown[cue] and state.validity.believes(cue) for cue in shown)
         if view.mask is None and told and not state.validity.lost:
-            # Another cue than the silhouette locates the person.
+            # A cue other than the silhouette locates the person.
             likely = modes.poses[modes.log_weights > -LIKELY_NATS]
             self.silhouettes.complete(view.image, track.person, self.camera, likely)
         if self.settings.ground.on:
@@ -484,8 +487,8 @@ class Tracker:
         """Updates the estimate; returns the result of `step`.
 
         Args:
-            stamp: of the image, ns.
-            observation: that the modes were fitted to; None: no fit.
+            stamp: timestamp of the image, ns.
+            observation: observation to which the modes were fitted; None: no fit.
         """
         state, track = self._state, self._track
         before, modes, posterior = state.stamp, track.modes, track.posterior

@@ -7,30 +7,30 @@
 P is the joint probability of v = (v_0, v_1, ..). v_0 is 1 if a mode of the track is near the
 person, v_g is 1 if cue g shows the person; a(dt) = tanh(dt / (2 tau)) is the remaining share of an
 image, because misfits persist (`error_model`). A misfit is attributed to the cue or to the track,
-to that of the two which is less likely given all other cues: (3) is exact, and summed over v_g it
-is minus the energy -log(p exp(-E_inlier) + (1 - p) exp(-E_outlier)). e_0 is the evidence of the
-outline of the silhouette for the track, whether the silhouette is valid or not: clothes in the
-colours of the room leave holes in it, but the rest of it is at the person.
+whichever is less probably valid given all other cues: (3) is exact, and summed over v_g it is minus
+the energy -log(p exp(-E_inlier) + (1 - p) exp(-E_outlier)). e_0 is the evidence of the silhouette's
+outline for the track, even if the silhouette is invalid: clothes in the colours of the room leave
+holes in it, but its remaining parts are at the person.
 
-A part of the body may be misplaced in a mode of a valid track, and cover anything: the e_g of parts
-is log(w exp(e_g) + 1 - w) - log(w + (1 - w) exp(e_g)), at most log w / (1 - w) either way,
-w = `PLACED_PROBABILITY`, except at a start, where the pose is given.
-A silhouette of something else draws the modes x to itself, which then explain it. If they miss more
-than a quarter of the keypoints, a pose x' by keypoints alone (`proposals.whole_poses`) represents
-the states without the silhouette:
+A mode of a valid track may misplace a part of the body. So e_g of the groups of keypoints becomes
+log(w exp(e_g) + 1 - w) - log(w + (1 - w) exp(e_g)), of size at most log w / (1 - w), with w =
+`PLACED_PROBABILITY`, except at a start, where the pose is given. A silhouette of another object
+attracts the modes x, which then explain it. If the modes miss more than a quarter of the keypoints,
+a pose x' fitted to keypoints alone (`proposals.whole_poses`) represents the states with an invalid
+silhouette:
 
     a sum_g v_g e_g  <-  log t(x_v) + a sum_g v_g min(e_g(x_v), 0)        x_v: x' where v_s = 0  (4)
 
-A pose that was moved to fit a cue is no evidence for that cue. t is the transition density of the
-pose from the previous image (`weighting`), in the image in which the two poses separated.
+A pose that was fitted to a cue is no evidence for that cue. t is the transition density of the pose
+from the previous image (`weighting`), used in the image in which x and x' separated.
 
-The misfit of depths is that of a pose moved to them, so depths do not test the track: they have a
+The misfit of depths is that of a pose moved to them, so depths do not test the track. They have a
 chain of their own, with the evidence log(P(v_0) exp(e_g) + 1 - P(v_0)).
 
-In an image each cue counts with the energy p_g E_g, to which the energy above is equal in first
-order around E_outlier, with the p_g of (1), before the image: weights and optima use the same sum.
-A cue that as a whole more likely shows something else is left out: a silhouette, depths, a
-detection. The p_g of groups of keypoints are those of a detector that sees the person.
+In an image each cue has the energy p_g E_g, the first-order expansion of the energy above around
+E_outlier, with the p_g from (1), before the image: weights and optima use the same sum. A
+silhouette, a depth image or a detection is left out if it more likely shows something else. The p_g
+of groups of keypoints are conditional on a detector that sees the person.
 """
 
 from __future__ import annotations
@@ -60,16 +60,17 @@ from hmt_ros.tracking.settings import (
 CHAIN = MarkovChain.of_two(*RATES['track and cues'])
 
 DEPTH = 'depth'
-# Misfit u at which a cue shows the person or something else with equal probability. Clothes in the
-# colours of the room leave holes in a silhouette.
+# Misfit u at which the evidence about a cue is zero. Clothes in the colours of the room leave holes
+# in a silhouette.
 UNDECIDED = {SILHOUETTE: 0.4, OUTLINE: 0.4, KEYPOINTS: 0.25, DEPTH: 0.15}
 # Axes of the joint probability: the track, the detector of keypoints, and the cues.
 TRACK, DETECTOR = range(2)
 AXES = {SILHOUETTE: slice(2, 3), KEYPOINTS: slice(3, 3 + EXCHANGED.shape[1])}
 CHAINS = AXES[KEYPOINTS].stop
-# States (2^n, n) of the chains, and validity v in each: groups of a failed detector are invalid.
+# States (2^n, n) of the chains, and validity v in each state: a failed detector's groups are
+# invalid.
 STATES = np.array(np.unravel_index(np.arange(2**CHAINS), (2,) * CHAINS)).T
-# (n, 2) rates at which each chain recovers and fails, 1/s.
+# Rates (n, 2) at which each chain recovers and fails, 1/s.
 AXIS_RATES = np.tile(RATES['track and cues'], (CHAINS, 1))
 AXIS_RATES[DETECTOR] = RATES['detector']
 VALID = STATES.astype(np.float64)
@@ -78,12 +79,12 @@ WITHOUT_SILHOUETTE = (VALID[:, AXES[SILHOUETTE]] == 0).all(1)
 
 
 class ByKeypoints(NamedTuple):
-    """A pose by keypoints alone, for when modes that follow the silhouette miss too many of them.
+    """Pose fitted to keypoints alone, used if the modes miss too many keypoints.
 
     Attributes:
-        keypoints: its misfit to the keypoints.
-        gain: log ratio of its transition density to that of the heaviest mode in the image in which
-            the two separated, nats; 0 after the first report.
+        keypoints: misfit of this pose to the keypoints.
+        gain: log ratio of the transition densities of this pose and of the heaviest mode, nats, in
+            the image in which they separated; 0 after the first report.
     """
 
     keypoints: Misfit
@@ -91,10 +92,10 @@ class ByKeypoints(NamedTuple):
 
 
 class Validity:
-    """Probabilities that the cues of one track, and the track, are valid.
+    """Probabilities that a track and its cues are valid.
 
     Attributes:
-        joint: (2^n,) probability of the states of the track, of the detector and of the cues.
+        joint: (2^n,) joint probabilities of the states of track, detector and cues.
     """
 
     def __init__(self) -> None:
@@ -108,12 +109,12 @@ class Validity:
 
     @property
     def track(self) -> float:
-        """Probability that some mode is about where the person is."""
+        """Probability that some mode is near the person."""
         return float(self._chains[TRACK])
 
     @property
     def cues(self) -> dict[str, Array]:
-        """Probabilities, by name of the cue, that its groups show the person.
+        """For each cue, the probabilities that its groups show the person.
 
         Shapes: silhouette (1,), keypoints by group (3,), depths (1,).
         """
@@ -125,7 +126,7 @@ class Validity:
 
     @property
     def lost(self) -> bool:
-        """Whether the modes are more likely away from the person than near."""
+        """Whether the modes are more likely away from the person than near the person."""
         return self.track < 0.5
 
     @property
@@ -140,7 +141,7 @@ class Validity:
 
     @property
     def shown(self) -> dict[str, float]:
-        """The probabilities by name, for messages and diagnostics."""
+        """Named probabilities for messages and diagnostics."""
         cues = self.cues
         trunk, arms, legs = (float(p) for p in cues[KEYPOINTS])
         return {
@@ -160,19 +161,19 @@ class Validity:
         self._take(joint)
 
     def search(self) -> None:
-        """Resets the probability of the track, whose modes start again."""
+        """Resets the probability of the track when its modes restart."""
         of_cues = self.joint.reshape(2, -1).sum(TRACK)
         self._take(np.multiply.outer(CHAIN.usual, of_cues).ravel())
 
     def update(
         self, misfits: Mapping[str, Misfit], dt: float, alone: ByKeypoints | None = None
     ) -> None:
-        """Updates the probabilities by the misfits of the modes to the cues of an image.
+        """Updates the probabilities from the misfits of the modes to the cues of an image.
 
         Args:
-            misfits: by cue, and of the outline of the silhouette.
+            misfits: misfits by name of the cue, and that of the silhouette's outline.
             dt: time since the previous image, s; infinite at a start.
-            alone: the pose by keypoints alone; None: not needed.
+            alone: pose fitted to keypoints alone; None: not needed.
         """
         share, begun = share_of_time(dt, MISFIT_TIME), bool(np.isfinite(dt))
         says = {
@@ -193,17 +194,17 @@ class Validity:
         self._take(update(self.joint, log_ratios))
 
     def update_depths(self, share: float, dt: float) -> None:
-        """Updates the validity of depths by their unexplained share; dt as for `update`."""
+        """Updates the validity of depths from their unexplained share; dt as in `update`."""
         self.update({DEPTH: Misfit(np.array([share]), np.array([VALIDITY_COUNT]))}, dt)
 
 
 def _divided(of_track: Array, share: float, alone: ByKeypoints) -> Array:
-    """Log likelihood ratios (2^n,) of the states if silhouette and keypoints disagree, (4).
+    """Log likelihood ratios (2^n,) of the states when silhouette and keypoints disagree, (4).
 
     Args:
-        of_track: (n,) evidence of the cues at the modes.
-        share: a(dt) of the image.
-        alone: the pose by keypoints.
+        of_track: (n,) evidence of each cue at the modes.
+        share: remaining share a(dt) of the image.
+        alone: pose fitted to keypoints alone.
     """
     own = of_track.copy()
     for axes in AXES.values():
@@ -215,11 +216,11 @@ def _divided(of_track: Array, share: float, alone: ByKeypoints) -> Array:
 
 
 def evidence_of(cue: str, misfit: Misfit, *, begun: bool = True) -> Array:
-    """Log likelihood ratios e_g of valid against invalid, (G,), equation (2), nats.
+    """Log likelihood ratios e_g (G,) of valid against invalid groups, nats, equation (2).
 
     Args:
-        cue: name of the cue, or of the outline.
-        misfit: of its groups.
+        cue: name of the cue, or `OUTLINE`.
+        misfit: misfit of the groups of the cue.
         begun: whether the track started before this image.
     """
     certainty = np.minimum(misfit.counts / VALIDITY_COUNT, 1.0)

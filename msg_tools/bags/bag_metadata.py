@@ -11,7 +11,7 @@ from msg_tools.files.error_line import error_line, one_line
 from msg_tools.files.plain_yaml import read_plain_yaml
 
 FILE_NAME = 'metadata.yaml'
-# Suffixes of the other files of a bag.
+# Suffixes of the data files of a bag.
 SUFFIXES = ('.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 VERSION = 9
 MAX_BYTES = 2**19
@@ -21,7 +21,7 @@ _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
 
 
 class BagError(ValueError):
-    """A bag can not be read or written; one line with the fault and the remedy."""
+    """A bag can not be read or written; the text is one line with the fault and the remedy."""
 
     def __init__(self, text: str) -> None:
         super().__init__(one_line(text))
@@ -51,7 +51,7 @@ def read_file_names(folder: Path) -> list[str]:
     """Names of the files of a bag, in order.
 
     Raises:
-        BagError: the metadata are missing or not those of a bag.
+        BagError: the metadata are missing, or are not from a bag.
     """
     path = folder / FILE_NAME
     if not path.is_file():

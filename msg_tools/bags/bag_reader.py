@@ -1,9 +1,9 @@
 """Reads a bag: a rosbag2 folder, or a single .mcap or .db3 file, also compressed with zstd.
 
-Messages are in the order of their log times, and those of equal times in the order of the files.
-Memory contains the chunks of the current time, never a whole file. Every fault of a bag raises a
-`BagError` of one line. A bag that was cut off by a crash is read up to its last complete message,
-with a warning in the log.
+Messages are sorted by log time; messages of equal times are in the order of the files. Only the
+chunks of the current time are in memory, never a whole file. Every fault of a bag raises a
+`BagError` with a text of one line. A bag that was cut off by a crash is read up to its last
+complete message, with a warning in the log.
 
     with BagReader('walk') as bag:
         topic = bag.find_topic(['sensor_msgs/msg/CompressedImage'])
@@ -48,7 +48,7 @@ Content = TypeVar('Content')
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
 _OURS = 'hmt_msgs/'
-# Maximum number of definitions of the messages of one topic, and of names in a line.
+# Maximum number of message definitions per topic, and of names in an error message.
 _MOST_DEFINITIONS, _MOST_NAMES = 4, 20
 _PIECE = 2**20
 
@@ -78,7 +78,7 @@ class BagMessage:
         path: path of the bag.
         topic: name of the topic as in the bag.
         msgtype: type, for example 'sensor_msgs/msg/Image'.
-        log_time_ns: time of the recording.
+        log_time_ns: time at which the message was recorded, ns.
         data: CDR bytes, as stored.
     """
 
@@ -99,11 +99,11 @@ class BagMessage:
         return self._deserialise(self)
 
     def content(self, read: Callable[[Any], Content]) -> Content:
-        """Returns the result of a function of the message.
+        """Returns the result of `read` for the message.
 
         Raises:
-            ValueError: the bytes do not match the type, or the function raises it; one line with
-                the place in the bag.
+            ValueError: the bytes do not match the type, or `read` raises ValueError; the text is
+                one line with topic and time.
         """
         message = self.message
         try:
@@ -113,7 +113,7 @@ class BagMessage:
             raise ValueError(f'{where}: {error}') from error
 
     def with_message(self, message: Any) -> BagMessage:
-        """Replaces the message by another of `rosbags`, without bytes."""
+        """Returns a copy with another `rosbags` message, and without bytes."""
         kind = message.__msgtype__
         return BagMessage(self.path, self.topic, kind, self.log_time_ns, b'', lambda _: message)
 
@@ -175,7 +175,7 @@ class BagReader(AbstractContextManager['BagReader']):
         self.close()
 
     def message_count(self, topics: Iterable[str] | None = None) -> int:
-        """Number of messages of some topics, or of all.
+        """Number of messages on the given topics, or on all topics.
 
         Raises:
             BagError: no such topic.
@@ -184,17 +184,17 @@ class BagReader(AbstractContextManager['BagReader']):
         return sum(self.topics[name].message_count for name in names)
 
     def topics_of(self, *msgtypes: str) -> list[Topic]:
-        """The topics of some types that have messages."""
+        """Topics of the given types that have messages."""
         return [x for x in self.topics.values() if x.msgtype in msgtypes and x.message_count]
 
     def topic(self, name: str) -> Topic:
-        """The topic with a name, with or without its leading slash.
+        """The topic with the given name, with or without a leading slash.
 
         A relative name that does not exist in the root selects the topic of that name in a
         namespace, if only one namespace has it.
 
         Raises:
-            BagError: no namespace or several namespaces have it.
+            BagError: no namespace or several namespaces have such a topic.
         """
         for candidate in (name, f'/{name}', name.removeprefix('/')):
             if candidate in self.topics:
@@ -207,14 +207,14 @@ class BagReader(AbstractContextManager['BagReader']):
         raise BagError(f'{self.path} has no topic {name}; it has {self._topic_names()}')
 
     def find_topic(self, msgtypes: Iterable[str], name: str | None = None) -> Topic:
-        """The only topic of some types, or the topic with a name.
+        """The only topic of the given types, or the topic with the given name.
 
         Args:
             msgtypes: accepted types.
             name: name of the topic, needed if several topics have such a type; None otherwise.
 
         Raises:
-            BagError: no topic, several topics, another type, or no message.
+            BagError: no such topic, several such topics, another type, or no messages.
         """
         wanted = list(msgtypes)
         short = ' or '.join(msgtype.rpartition('/')[2] for msgtype in wanted)
@@ -247,8 +247,8 @@ class BagReader(AbstractContextManager['BagReader']):
             topics: names of topics, with or without leading slash; None for all topics.
 
         Raises:
-            BagError: no such topic, or a topic is not CDR or has two types; or the bag is damaged,
-                which is raised after the messages before the damage.
+            BagError: a topic does not exist, is not CDR, or has two types; or the bag is damaged
+                (raised after the messages before the damage).
         """
         if topics is None:
             return self._merged(self.topics)
@@ -292,7 +292,7 @@ class BagReader(AbstractContextManager['BagReader']):
                     channel.definition_encoding,
                     channel.definition,
                 )
-            # Compression mode "message" of a bag; no CDR message starts with these bytes.
+            # A bag can compress each message; no CDR message starts with these bytes.
             if data[:4] == _ZSTD_MAGIC:
                 data = b''.join(_decompressed(data, budget, LARGEST))
             message = deserialise(data, stored.msgtype, store, budget)
@@ -316,7 +316,7 @@ class BagReader(AbstractContextManager['BagReader']):
     # Files
 
     def _storage_paths(self) -> list[Path]:
-        if os.path.isfile(self.path):  # noqa: PTH113 - False, too, for names that can not be
+        if os.path.isfile(self.path):  # noqa: PTH113 - also False for impossible names
             return [self.path]
         if not os.path.isdir(self.path):  # noqa: PTH112
             raise BagError(
@@ -324,7 +324,7 @@ class BagReader(AbstractContextManager['BagReader']):
             )
         paths = [self.path / name for name in read_file_names(self.path)]
         for path in paths:
-            if not os.path.isfile(path):  # noqa: PTH113 - False, too, for names that can not be
+            if not os.path.isfile(path):  # noqa: PTH113 - also False for impossible names
                 raise BagError(
                     f'{self.path}: the file {path.name[:100]}, which its metadata names, is missing'
                 )
@@ -350,7 +350,7 @@ class BagReader(AbstractContextManager['BagReader']):
         raise BagError(f'{name} is not a bag: it {seen}, wanted an MCAP or SQLite recording')
 
     def _decompressed(self, path: Path, budget: Budget) -> Path:
-        """The content of a zstd file in a temporary file, which `close` removes."""
+        """Decompresses a zstd file into a temporary file, which `close` removes."""
         folder = self._scratch.enter_context(tempfile.TemporaryDirectory(prefix='bag_reader.'))
         target = Path(folder) / path.stem
         with path.open('rb') as compressed, target.open('wb') as plain:
@@ -362,8 +362,8 @@ class BagReader(AbstractContextManager['BagReader']):
 def _tell_cut_off(name: str) -> None:
     """Logs a warning once per file, because a command opens a bag several times."""
     _log.warning(
-        '%s breaks off: it is read up to its last complete message; `mcap recover` makes a whole '
-        'file of it, and `ros2 bag reindex` the metadata of its folder',
+        '%s breaks off: it is read up to its last complete message; `mcap recover` repairs the '
+        'file, and `ros2 bag reindex` the metadata of its folder',
         name,
     )
 
@@ -400,12 +400,12 @@ def _listed(names: Collection[str]) -> str:
 def _from_its_start(
     file: McapFile | SqliteFile, topics: Collection[str], budget: Budget
 ) -> Iterator[StoredMessage]:
-    """Yields a mark at the first log time, then the messages; opens the file after the mark."""
+    """Yields a time mark at the first log time, then opens the file and yields its messages."""
     yield StoredMessage(file.start, None, b'')
     yield from file.messages(topics, budget)
 
 
 def _full_name(msgtype: str) -> str:
-    """Name of a type with its middle part, which older recorders omitted."""
+    """Full name of a type; older recorders omitted the middle part, `msg`."""
     package, slash, name = msgtype.partition('/')
     return f'{package}/msg/{name}' if slash and '/' not in name else msgtype

@@ -1,13 +1,13 @@
 """Writes messages into a bag that rosbag2 plays, completely or not at all.
 
-Topics have absolute names, because rosbag2 compares names literally. A relative name is resolved in
-the namespace of the bag, as a node resolves it in its own. Log time and publish time are both the
-stamp given by the caller.
+Topics have absolute names, because rosbag2 compares names literally. Relative names are resolved
+in the namespace of the bag, as nodes resolve names. Log time and publish time are both the stamp
+given by the caller.
 
 The bag is written into a hidden folder `.<name>.<random>.partial` next to its place, and moved when
-it is complete and on the disk; an error removes it. If the process is killed the hidden folder
-stays; each complete chunk is flushed at once, so that its file can be read except for the last
-chunk. Chunks, data and summary have checksums. The same calls write the same bytes.
+it is complete and on the disk; an error removes it. If the process is killed, the hidden folder
+remains, and its file can be read except for the last chunk, because chunks are flushed at once.
+Chunks, data and summary have checksums. The same calls write the same bytes.
 
     with BagWriter('out') as bag:
         bag.add_topic('body', 'hmt_msgs/msg/Body', latched=True)
@@ -46,7 +46,7 @@ _FOLDER = FolderKind('a bag', FILE_NAME, tuple(f'*{suffix}' for suffix in SUFFIX
 
 
 class _Dropped(Exception):
-    """Ends a new folder without moving it to its place."""
+    """Raised to remove a new folder instead of moving it to its place."""
 
 
 @dataclass
@@ -61,7 +61,7 @@ class _Topic:
 
 
 class BagWriter(AbstractContextManager['BagWriter']):
-    """A bag that is open for writing; the context manager closes it, or drops it on an error.
+    """A bag that is open for writing; the context manager closes it, or removes it on an error.
 
     Args:
         path: folder to write, `<name>`; the file in it is `<name>.mcap`.
@@ -106,7 +106,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             self.abort()
 
     def add_topic(self, name: str, msgtype: str, *, latched: bool = False) -> None:
-        """Adds a topic; `write` also adds unknown topics, which are not latched.
+        """Adds a topic; `write` also adds missing topics, which are not latched.
 
         Args:
             name: name of the topic, absolute or relative to the namespace.
@@ -180,7 +180,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         """Completes the bag and moves it to its place, unless it is already closed.
 
         Raises:
-            BagError: the disk is full, or its place is occupied by now; all files are removed.
+            BagError: the disk is full, or the folder exists by now; all files are removed.
         """
         if self._file is None or self._file.closed:
             return
@@ -200,7 +200,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             _sync_folder(self.path.parent)
 
     def abort(self) -> None:
-        """Removes all that was written."""
+        """Removes everything that was written."""
         if self._file is not None:
             # Closing writes the buffer and may fail again on a full disk, which is harmless here.
             with suppress(OSError):

@@ -1,6 +1,6 @@
-"""An MCAP file of a bag.
+"""Reads an MCAP file of a bag.
 
-An incomplete file is read up to its last complete message; a pass over the file makes the missing
+An incomplete file is read up to its last complete message; a pass over the file builds the missing
 index. Checksums of chunks are verified if the file has them. Lengths are compared with the size of
 the file and charged to a budget before memory is allocated; attachments are not read.
 
@@ -38,18 +38,18 @@ from msg_tools.files.budget import Budget, BudgetError
 
 MAGIC = b'\x89MCAP0\r\n'
 
-# Opcode and length in front of every record, and the needed fields of some records.
+# Layout of the head of a record (opcode, length), and of the needed fields of some records.
 _RECORD = struct.Struct('<BQ')
 _MESSAGE = struct.Struct('<HIQQ')
 _CHUNK = struct.Struct('<16xQI')
 _FOOTER = struct.Struct('<B8xQ12x8s')
 _DESCRIPTIONS: dict[int, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: ChannelRecord}
 
-# Maximum size of a summary, of a schema or channel, of records outside of chunks that are read at
-# once, and of all open chunks, bytes; memory per byte of a schema or channel.
+# Maximum size, bytes, of a summary, of a schema or channel, of a run of records outside of chunks,
+# and of all open chunks together; then bytes of memory per byte of a schema or channel.
 _MAX_SUMMARY, _MAX_DESCRIPTION, _MAX_RUN, _MAX_OPEN = 2**25, 2**20, 2**20, 2**28 + 2**27
 _MEMORY = 16
-_SKIPPED = 8  # number of records that a skipped record counts as, since most are larger
+_SKIPPED = 8  # cost of a skipped record in the budget, in records
 
 
 @dataclass
@@ -144,14 +144,14 @@ class McapFile:
             self.counts[channel] += index.counts[key]
 
     def messages(self, topics: Collection[str], budget: Budget) -> Iterator[StoredMessage]:
-        """Yields messages of some topics, and marks, by log time, then by offset in the file.
+        """Yields messages of the given topics, and time marks, by log time, then by file offset.
 
         Args:
             budget: budget for one pass over the bag.
 
         Raises:
-            BagError: the file is damaged, which is raised after the messages before the damage; or
-                it exceeds the budget.
+            BagError: the file is damaged (raised after the messages before the damage), or exceeds
+                the budget.
         """
         wanted = {key for key, channel in self._channels.items() if channel.topic in topics}
         with faults_told(self.name), self._path.open('rb') as opened:
@@ -168,7 +168,7 @@ class McapFile:
 
 
 class _File:
-    """A file during one pass over it, which spends a budget.
+    """An open file during one pass, which is charged to a budget.
 
     Attributes:
         size: size of the file, bytes.
@@ -188,7 +188,7 @@ class _File:
         return self._file.read(end - offset)
 
     def records(self, data: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
-        """Yields opcode, and start and end of the content, of each record."""
+        """Yields the opcode of each record, and the start and end of its content."""
         end, opcode, length = 0, 0, 0
         while end < len(data):
             self.budget.spend(records=1)
@@ -201,7 +201,7 @@ class _File:
             yield opcode, start, end
 
     def content(self, offset: int, end: int) -> bytes | memoryview:
-        """Records in the chunk, or outside of chunks, between two offsets of the file."""
+        """Decompressed chunk, or records outside of chunks, between two offsets of the file."""
         if end - offset > LARGEST + _MAX_RUN:
             raise McapError(f'a record of {end - offset} bytes')
         record = memoryview(self.read(offset, end))
@@ -227,7 +227,7 @@ class _File:
     def messages(
         self, chunk: ChunkIndex, channels: Mapping[int, Channel], wanted: Collection[int]
     ) -> Iterator[StoredMessage]:
-        """Yields a mark at the start time of a chunk, then reads it and yields its messages."""
+        """Yields a time mark at the start of a chunk, then reads it and yields its messages."""
         yield StoredMessage(chunk.message_start_time, None, b'')
         start = chunk.chunk_start_offset
         data = self.content(start, start + chunk.chunk_length)
@@ -255,7 +255,7 @@ class _File:
 
 
 def _unpacked(packed: memoryview, compression: bytes, size: int) -> bytes:
-    """Content of a chunk; allocates no memory beyond the given size."""
+    """Decompresses a chunk; allocates no memory beyond the given size."""
     whole = True
     if compression == b'zstd':
         known = zstandard.get_frame_parameters(packed).content_size
@@ -304,7 +304,7 @@ def _written_index(file: _File) -> _Index | None:
 
 
 def _index_of_a_pass(file: _File) -> _Index:
-    """Makes the index of a file up to its end, or to the first missing or damaged byte."""
+    """Builds the index by reading the file up to its end, or to the first damaged byte."""
     index = _Index()
     try:
         for start, end, bare in _pieces(file):
@@ -317,7 +317,7 @@ def _index_of_a_pass(file: _File) -> _Index:
 
 
 def _pieces(file: _File) -> Iterator[tuple[int, int, bool]]:
-    """Yields start and end of each chunk (False) and run of records outside of chunks (True)."""
+    """Yields (start, end, bare) of chunks, and of runs of records outside of chunks (bare)."""
     run = at = len(MAGIC)
     opcode = 0
     try:

@@ -1,7 +1,7 @@
-"""A .db3 file of a bag, the default storage before ROS 2 Iron.
+"""Reads a .db3 file of a bag, the default storage before ROS 2 Iron.
 
 The database is opened read-only, and only its tables are read, because views, virtual tables and
-generated columns could compute endlessly. The number of steps of SQLite for a query is limited.
+generated columns could compute endlessly. The number of SQLite steps for queries is limited.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from msg_tools.messages.definitions import MAX_BYTES
 
 MAGIC = b'SQLite format 3\x00'
 
-# Maximum number of steps of the virtual machine of SQLite for a file, and more for each byte (a row
-# of more than ten bytes takes about thirty steps); steps between two checks; maximum memory of
-# SQLite in the whole process, bytes.
+# Maximum number of steps of SQLite's virtual machine for a file, and additional steps per byte (a
+# row has more than ten bytes and takes approximately thirty steps); steps between two checks;
+# maximum memory of SQLite in the whole process, bytes.
 _STEPS, _STEPS_PER_BYTE, _STEPS_AT_ONCE, _MEMORY = 10**7, 4, 10**5, 2**29
 
 
 class SqliteFile:
-    """An SQLite file; see `McapFile`.
+    """An SQLite file, with the same attributes and methods as `McapFile`.
 
     Args:
         budget: budget for opening the bag.
@@ -102,13 +102,13 @@ def _connected(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _mentions(database: sqlite3.Connection, word: str) -> bool:
-    """Whether a statement of the schema contains a word; its column `type` may be forged."""
+    """Whether an SQL statement of the schema has a word; the schema's `type` can be forged."""
     query = 'SELECT 1 FROM sqlite_master WHERE CAST(sql AS TEXT) LIKE ?'
     return database.execute(query, (f'%{word}%',)).fetchone() is not None
 
 
 def _is_table(database: sqlite3.Connection, name: str) -> bool:
-    """Whether a name is that of a table of stored columns; the schema must have no views."""
+    """Whether a table has this name and only stored columns; the schema must have no views."""
     columns = database.execute('SELECT hidden FROM pragma_table_xinfo(?)', (name,)).fetchall()
     return bool(columns) and not any(hidden for (hidden,) in columns)
 

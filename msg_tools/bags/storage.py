@@ -34,7 +34,7 @@ class Channel(NamedTuple):
 
 
 class StoredMessage(NamedTuple):
-    """A message as stored, with its log time, ns; one without a channel is only a mark."""
+    """A stored message with its log time, ns; without a channel it is only a time mark."""
 
     log_time: int
     channel: Channel | None
@@ -43,7 +43,7 @@ class StoredMessage(NamedTuple):
 
 @contextmanager
 def faults_told(name: str) -> Iterator[None]:
-    """Turns any exception into a BagError, because libraries do not document theirs."""
+    """Turns any exception into a BagError, because libraries do not document their exceptions."""
     try:
         yield
     except OSError as error:

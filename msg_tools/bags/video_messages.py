@@ -21,7 +21,7 @@ from msg_tools.messages.message_types import RosbagsMessages
 
 VIDEO_TYPE = 'foxglove_msgs/msg/CompressedVideo'
 _TYPES = ('sensor_msgs/msg/CompressedImage', VIDEO_TYPE)
-_MOST_WAITING = 32  # maximum number of packets without a picture so far
+_MOST_WAITING = 32  # maximum number of packets that are not decoded yet
 # Name of the decoder by the format in a message.
 _CODECS = {'h264': 'h264', 'h265': 'hevc', 'hevc': 'hevc', 'vp9': 'vp9', 'av1': 'av1'}
 
@@ -30,7 +30,7 @@ def is_video(bag: BagReader, topic: Topic) -> bool:
     """Whether the first message of a topic belongs to a video.
 
     Raises:
-        BagError: it belongs to a video, and PyAV is not installed.
+        BagError: the message belongs to a video, and PyAV is not installed.
     """
     if topic.msgtype not in _TYPES or not topic.message_count:
         return False
@@ -67,7 +67,7 @@ def with_pictures(messages: Iterator[BagMessage], topic: str) -> Iterator[BagMes
         yield from video.pictures(None)
         if not video.started:
             raise BagError(
-                f'{topic}: none of its {video.count} packets of video is a whole key frame'
+                f'{topic}: none of its {video.count} packets of video is a complete key frame'
             )
 
 
@@ -96,11 +96,11 @@ class _Video:
         self._av = _library(topic, codec)
         self._decoder = self._av.CodecContext.create(codec, 'r')
         self._decoder.options = {'max_pixels': str(MAX_PIXELS)}
-        self._packets: dict[int, BagMessage] = {}  # packets without a picture so far
+        self._packets: dict[int, BagMessage] = {}  # packets that are not decoded yet
         self.count, self.started = 0, False
 
     def pictures(self, stored: BagMessage | None) -> Iterator[BagMessage]:
-        """Yields the pictures that a packet completes; None ends the video."""
+        """Decodes a packet and yields the completed pictures; None ends the video."""
         packet = None
         if stored is not None:
             packet = self._av.Packet(np.asarray(stored.message.data, dtype=np.uint8).tobytes())

@@ -1,1 +1,1 @@
-"""Safe reading of untrusted files, and atomic writing of folders; imports no other package here."""
+"""Safe reading of untrusted files, and atomic writing of folders and files."""

@@ -27,13 +27,13 @@ from msg_tools.files.error_line import error_line
 LARGEST_ARCHIVE = 2**29
 _MOST_ARRAYS = 10_000
 _KINDS = 'biufSU'
-_SMALLEST = 4  # minimum number of bytes that a number counts as
-_LONGEST = 10**6  # maximum side of an array without bytes
+_SMALLEST = 4  # minimum counted size of a number, bytes
+_LONGEST = 10**6  # maximum length of an axis of an array without data
 _HEADS = {
     (1, 0): array_format.read_array_header_1_0,
     (2, 0): array_format.read_array_header_2_0,
 }
-# Exceptions that damaged archives cause, besides OSError and ValueError.
+# Exceptions from damaged archives, in addition to OSError and ValueError.
 _FAULTS = (
     zipfile.BadZipFile,
     zipfile.LargeZipFile,
@@ -60,8 +60,8 @@ def read_archive(path: str | Path, largest: int = LARGEST_ARCHIVE) -> dict[str, 
 
     Raises:
         OSError: the file can not be read.
-        ValueError: the file is no archive, is damaged or too large, or contains objects; one line,
-            without the path.
+        ValueError: the file is not an archive, is damaged or too large, or contains objects; the
+            text is one line without the path.
     """
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:

@@ -7,10 +7,10 @@ to have much content.
 
 from __future__ import annotations
 
-# Unpacked size that every file may have, and more per byte of the file, bytes. Images of one colour
-# are compressed a thousandfold, camera images and messages rarely tenfold.
+# Unpacked size allowed for every file, and additional size per byte of the file, bytes. Images of
+# one colour are compressed a thousandfold, camera images and messages rarely tenfold.
 FREE_BYTES, BYTES_PER_BYTE = 2**26, 100
-# Number of records, rows or nodes that every file may have, and bytes of the file for one more.
+# Number of records, rows or nodes allowed in every file, and file size per additional one, bytes.
 FREE_RECORDS, BYTES_PER_RECORD = 100_000, 4
 
 
@@ -19,7 +19,7 @@ class BudgetError(ValueError):
 
 
 class Budget:
-    """Bytes and records that the reader of one file may still use.
+    """The remaining bytes and records for the reader of one file.
 
     Args:
         size: size of the file, bytes.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from msg_tools.files.mp4_boxes import boxes_at, mapped
 
-# Matrices of the identity, and of clockwise rotations by angle, degrees.
+# Identity matrix, and matrices of clockwise rotations by angle, degrees.
 STORED = 1, 0, 0, 1
 TURNED = {0: STORED, 90: (0, 1, -1, 0), 180: (-1, 0, 0, -1), 270: (0, -1, 1, 0)}
 
@@ -53,7 +53,7 @@ def is_turned(matrix: Matrix) -> bool:
 
 
 def shown(image: NDArray[Any], matrix: Matrix) -> NDArray[Any]:
-    """An image (H, W, C) as a matrix shows it, to the nearest quarter turn."""
+    """Applies a display matrix to an image (H, W, C), rounded to the nearest quarter turn."""
     across, down = matrix[0], matrix[3]
     if is_turned(matrix):
         across, down = matrix[2], matrix[1]

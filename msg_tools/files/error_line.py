@@ -1,12 +1,12 @@
 """Converts untrusted text to one short line for logs, messages and terminals.
 
-Characters that control a terminal or change the display of others are escaped: control characters,
-those that change the direction of text, that have no width, or that represent no text.
+Characters that control a terminal or affect the display of other characters are escaped: control
+characters, and characters that reverse the direction of text, have no width, or represent no text.
 """
 
 from __future__ import annotations
 
-# Maximum length of a line, and of a text that a log extends, characters.
+# Maximum length of a line, and of a text that is a part of a line, characters.
 LONGEST_LINE, LONGEST_TEXT = 300, 250
 
 
@@ -27,6 +27,6 @@ def printable(text: str, most: int = LONGEST_LINE) -> str:
 
 
 def _shortened(text: str, most: int) -> str:
-    """Cuts out the middle of a long text; the place is at its start, the remedy at its end."""
+    """Cuts out the middle of a long text; errors name the place first and the remedy last."""
     end = most // 3
     return text if len(text) <= most else f'{text[: most - end - 5]} ... {text[-end:]}'

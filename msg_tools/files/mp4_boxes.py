@@ -22,7 +22,7 @@ def mapped(path: Path) -> Iterator[Data]:
     """Maps the content of a file into memory.
 
     Raises:
-        OSError: the file can not be read, or is no regular file.
+        OSError: the file can not be read, or is not a regular file.
     """
     with open_regular(path) as file:
         if not os.fstat(file.fileno()).st_size:
@@ -33,7 +33,7 @@ def mapped(path: Path) -> Iterator[Data]:
 
 
 def boxes(data: Data, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
-    """Yields kind, and start and end of the content, of the boxes in a part of a file.
+    """Yields kind, content start and content end of the boxes in a part of a file.
 
     A damaged box and all later boxes are left out.
     """
@@ -53,7 +53,7 @@ def boxes(data: Data, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
 
 
 def boxes_at(data: Data, start: int, end: int, *kinds: bytes) -> Iterator[tuple[int, int]]:
-    """Yields start and end of the content of the boxes at a path of kinds."""
+    """Yields content start and content end of the boxes at a path of nested kinds."""
     for kind, first, last in boxes(data, start, end):
         if kind == kinds[0] and kinds[1:]:
             yield from boxes_at(data, first, last, *kinds[1:])

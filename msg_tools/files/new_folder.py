@@ -1,8 +1,8 @@
 """Writes folders and files completely or not at all.
 
-Both are made in a hidden folder beside their place, `.<name>.<random>.partial`, and then renamed.
-The hidden folder is locked while in use. One without a lock is from a killed process, and is
-removed after the next write to the same place. Links are neither replaced nor followed.
+They are made in a hidden folder beside the target, `.<name>.<random>.partial`, and then renamed.
+The hidden folder is locked while in use. A hidden folder without a lock is from a killed process,
+and is removed after the next write to the same place. Links are neither replaced nor followed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class FolderKind:
     Attributes:
         what: name of such a folder in messages, for example 'a bag'.
         marker: name of the file that every such folder has.
-        own: patterns of the names of the other files that it may have.
+        own: patterns for the names of its other files.
     """
 
     what: str
@@ -40,10 +40,10 @@ class FolderKind:
     own: tuple[str, ...]
 
     def check_place(self, target: Path, *, overwrite: bool) -> None:
-        """Raises ValueError if a folder can not be written to its place.
+        """Raises ValueError if a folder of this kind can not be written at `target`.
 
         Args:
-            overwrite: whether an existing folder of this kind may be replaced.
+            overwrite: whether to accept an existing folder of this kind, which is then replaced.
         """
         if not os.path.lexists(target):
             return
@@ -57,7 +57,7 @@ class FolderKind:
 
     @contextmanager
     def new(self, target: Path, *, overwrite: bool) -> Iterator[Path]:
-        """Yields the path at which to make a folder, which is moved to its place at the end.
+        """Yields a temporary path for the new folder, which is moved to `target` at the end.
 
         The yielded path does not exist yet. After an error all files are removed.
 
@@ -80,22 +80,23 @@ class FolderKind:
 
 
 def check_file_place(target: Path, *, overwrite: bool) -> None:
-    """Raises ValueError if a file can not be written to its place.
+    """Raises ValueError if a file can not be written at `target`.
 
     Args:
-        overwrite: whether an existing file may be replaced; links are never replaced.
+        overwrite: whether to accept an existing file, which is then replaced; links are never
+            accepted.
     """
     if os.path.lexists(target) and not overwrite:
         raise ValueError(f'{target} exists; give another name, or --overwrite')
     if target.is_symlink() or (target.exists() and not target.is_file()):
         raise ValueError(f'{target} is not replaced: it is a link or no file; give another name')
     if not os.access(target.absolute().parent, os.W_OK):
-        raise ValueError(f'{target} can not be written: its folder is no place to write to')
+        raise ValueError(f'{target} can not be written: its folder is missing or not writable')
 
 
 @contextmanager
 def new_file(target: Path) -> Iterator[BinaryIO]:
-    """Yields an open file, which is moved to its place at the end, or removed on an error.
+    """Yields an open file, which is moved to `target` at the end, or removed on an error.
 
     Raises:
         ValueError: see `check_file_place`; an existing file is replaced.
@@ -111,10 +112,10 @@ def new_file(target: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def _made_aside(target: Path, own: Sequence[str]) -> Iterator[Path]:
-    """Yields the path at which to make a file or folder, which replaces the target at the end.
+    """Yields a temporary path for a file or folder, which replaces the target at the end.
 
     Args:
-        own: patterns of the names of the files that it may have.
+        own: patterns for the names of the files that this write makes.
     """
     around = Path(tempfile.mkdtemp(prefix=f'.{target.name}.', suffix=_PARTIAL, dir=target.parent))
     replaced = around / _REPLACED
@@ -139,7 +140,7 @@ def locked(folder: Path) -> Iterator[bool | None]:
     """Locks a folder, so that other processes see that it is in use.
 
     Yields:
-        Whether it was free; None if the file system has no locks, as some network file systems.
+        Whether the folder was free; None if the file system has no locks, as on some networks.
     """
     descriptor = os.open(folder, os.O_DIRECTORY)
     try:
@@ -154,7 +155,7 @@ def locked(folder: Path) -> Iterator[bool | None]:
 
 
 def _remove_remains(target: Path, own: Sequence[str]) -> None:
-    """Removes and logs hidden folders that killed processes have left beside a place."""
+    """Removes and logs hidden folders that killed processes have left beside the target."""
     hidden = re.compile(rf'\.{re.escape(target.name)}\.[a-z0-9_]{{8}}{re.escape(_PARTIAL)}')
     with suppress(OSError):
         for path in sorted(target.parent.iterdir()):
@@ -162,11 +163,11 @@ def _remove_remains(target: Path, own: Sequence[str]) -> None:
                 with locked(path) as free:
                     if free and _holds_only(path, target.name, own):
                         shutil.rmtree(path)
-                        _log.warning('%s: removed, a run that was killed had left it', path)
+                        _log.warning('%s: removed; a run that was killed had left it', path)
 
 
 def _holds_only(folder: Path, name: str, own: Sequence[str]) -> bool:
-    """Whether a hidden folder contains only files that a write to its place makes."""
+    """Whether a hidden folder contains only files of an unfinished write."""
     return all(
         not _foreign(files, own)
         and not _foreign(folders, (glob.escape(name), _REPLACED, f'*{_PARTIAL}'))

@@ -10,7 +10,7 @@ from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.error_line import error_line
 
 LARGEST = 700_000_000  # maximum memory of the text and its values, bytes
-# Memory of the Python list, dictionary, number or string that starts with a character, bytes.
+# Memory per character that starts a Python object (list, dictionary, number or string), bytes.
 _TAKES = {b'[': 104, b'{': 210, b',': 24, b'"': 32}
 
 
@@ -30,7 +30,7 @@ def load_plain_json(content: bytes | str) -> Any:
     """Parses the value in a text.
 
     Raises:
-        ValueError: not JSON, nested too deep, or the values need too much memory; one line.
+        ValueError: not JSON, nested too deep, or the values need too much memory.
     """
     text = content.encode('utf-8', 'surrogatepass') if isinstance(content, str) else content
     needed = len(text) * (2 if text.isascii() else 5)

@@ -54,8 +54,8 @@ def read_plain_yaml(path: str | Path, largest: int) -> Any:
         largest: maximum size of the file, bytes.
 
     Raises:
-        ValueError: the file can not be read, is too large, or is not plain YAML; one line, without
-            the path.
+        ValueError: the file can not be read, is too large, or is not plain YAML; the text is one
+            line without the path.
     """
     content = read_bytes(path, largest)
     try:
@@ -68,7 +68,7 @@ def load_plain_yaml(text: str) -> Any:
     """Parses the document in a text.
 
     Raises:
-        ValueError: not YAML, or YAML that is not plain; one line.
+        ValueError: not YAML, or YAML that is not plain; the error is one line.
     """
     try:
         return yaml.load(text, Loader=_PlainLoader)

@@ -31,10 +31,10 @@ def open_video(path: Path) -> cv2.VideoCapture:
 
     Raises:
         OSError: the file can not be read.
-        ValueError: another format, a damaged file, or images that are too large; one line.
+        ValueError: another format, a damaged file, or images that are too large.
     """
     with mapped(path) as data:
-        # Tables of images of one size, and those of fragments, can claim images without bytes.
+        # Tables of equal-sized images, and tables of fragments, can claim images without bytes.
         tables = boxes_at(data, 0, len(data), b'moov', b'trak', b'mdia', b'minf', b'stbl', b'stsz')
         runs = boxes_at(data, 0, len(data), b'moof', b'traf', b'trun')
         counts = chain(((at + 8, end) for at, end in tables), ((at + 4, end) for at, end in runs))

@@ -38,7 +38,7 @@ def message_of_body(messages: MessageFactory, body: Body, stamp_ns: int, frame_i
 
 
 def resized(model: Body, segment_lengths: Mapping[str, float]) -> Body:
-    """A body model with the segment lengths of a message, m; empty keeps its own lengths.
+    """A body model with the segment lengths of a message, m; empty keeps the model's lengths.
 
     Raises:
         MessageError: a length of an unknown segment, or one that is not finite.
@@ -57,7 +57,7 @@ def body_of(
     Messages of other publishers may have no lengths; the model then keeps its own lengths.
 
     Args:
-        any_name: whether the message may have another name for the model.
+        any_name: whether to accept a message with another name of the model.
 
     Raises:
         MessageError: a mixture of another model, or of other degrees of freedom.

@@ -18,9 +18,10 @@ from hmt_ros.body.camera import unfolded_share
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_types import MessageFactory
 
-# Number of zero coefficients that represent no distortion.
+# Number of coefficients per model in a message; without distortion all are 0.
 _COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
-# Other names of the models. The number of coefficients gives the model of a pinhole, as in OpenCV.
+# Other names of the models. The model of a pinhole follows from the number of coefficients, as in
+# OpenCV.
 _PINHOLE = ('pinhole', 'perspective', 'none')
 _ALIASES = {
     'radtan': 'plumb_bob',
@@ -31,21 +32,21 @@ _ALIASES = {
     'kannala_brandt': 'equidistant',
     'kannala_brandt4': 'equidistant',
 }
-# Maximum skew that is ignored, in focal lengths; it shifts the border by about 2 px at most.
+# Maximum skew that is ignored, in focal lengths; it shifts the border by up to about 2 px.
 _LARGEST_SKEW = 0.01
 
 # Limits of a valid calibration: ratio of focal lengths and principal point to the size of the
-# picture, and size of distortion coefficients.
+# picture, and absolute value of distortion coefficients.
 _FARTHEST = 1000.0
 _LARGEST_COEFFICIENT = 1e6
 
 
 class CameraInfoError(ValueError):
-    """A camera info is invalid; one line with the value seen and the value wanted."""
+    """A camera info is invalid; the text is one line with the value seen and the value wanted."""
 
 
 class UncalibratedError(CameraInfoError):
-    """A camera info of a camera that is not calibrated."""
+    """A camera info is from a camera without calibration."""
 
 
 def camera_from_info(
@@ -53,13 +54,13 @@ def camera_from_info(
     image_size: tuple[int, int] | None = None,
     tell: Callable[[str], object] = lambda text: None,
 ) -> Camera:
-    """The camera that took the pictures.
+    """Converts a camera info to a camera.
 
     Args:
         message: sensor_msgs/CameraInfo, of `rosbags` or of ROS.
         image_size: (width, height) of the pictures, px; a calibration for another size with the
             same aspect ratio is scaled.
-        tell: called with a line on each approximation.
+        tell: called with a line of text for each approximation.
 
     Raises:
         CameraInfoError: not calibrated, values that are not finite or contradict each other, or an
@@ -104,8 +105,9 @@ def camera_from_info(
         )
         if (share := unfolded_share(camera)) < 1.0:
             tell(
-                f'camera info: the distortion folds or overstretches the image from {share:.0%} of '
-                'the way to a corner on: nothing is right there; calibrate with the pattern there'
+                f'camera info: beyond {share:.0%} of the way to a corner the distortion folds or '
+                'overstretches the image, and positions are wrong; calibrate with the pattern '
+                'there'
             )
         if image_size is None or tuple(image_size) == (width, height):
             return camera
@@ -115,7 +117,7 @@ def camera_from_info(
         raise CameraInfoError(f'camera info: {error}') from error
     tell(
         f'camera info: the calibration for images of {width}x{height} pixels is scaled to '
-        f'{wide}x{high}; it is wrong if these are cut from larger ones'
+        f'{wide}x{high}; it is wrong if these are cropped from larger ones'
     )
     return scaled
 
@@ -157,13 +159,13 @@ def _distortion(model: str, coefficients: list[float]) -> tuple[str, tuple[float
             f'camera info: D has {len(coefficients)} coefficients, but no distortion model'
         )
     if model == 'rational_polynomial' and not any(coefficients[8:]):
-        # OpenCV appends coefficients of thin prism and tilt.
+        # Remove the thin prism and tilt coefficients that OpenCV appends.
         coefficients = coefficients[:8]
     return model, tuple(coefficients)
 
 
 def _region(message: Any) -> tuple[int, int, int, int]:
-    """Offset and size of the part of the sensor in the picture, px."""
+    """Offset and size, px, of the sensor region that the picture shows."""
     width, height = int(message.width), int(message.height)
     if width < 1 or height < 1:
         raise CameraInfoError(f'camera info: size is {width}x{height}, wanted that of the picture')

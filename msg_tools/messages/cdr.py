@@ -1,11 +1,11 @@
 """Converts messages to CDR bytes and back, without ROS.
 
-CDR leaves the bytes that pad a field to its alignment undefined, and in the ROS 2 middleware they
-have old content of its buffer; `rclpy.serialization.serialize_message` even appends bytes after an
-empty sequence. `serialise` writes zeros into the padding and nothing after the message, so that
-equal messages have equal bytes. A node that publishes these bytes (`Publisher.publish` accepts
-them) sends and records the same bytes as an offline run writes. The middleware may only append
-bytes at the end, up to a multiple of four, which `canonical` removes.
+CDR does not define the values of padding bytes; the ROS 2 middleware leaves old buffer content in
+them, and `rclpy.serialization.serialize_message` even appends bytes after an empty sequence.
+`serialise` writes zeros into the padding and nothing after the message, so that equal messages have
+equal bytes. A node that publishes these bytes (`Publisher.publish` accepts them) sends and records
+the same bytes as an offline run writes. The middleware only appends bytes up to a multiple of four,
+which `canonical` removes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from msg_tools.messages.message_types import typestore
 
 _HEADER_BYTES = 4
 # Maximum number of values of a message (up to 100 bytes and 1 us each), and number of values that
-# count as one record of the budget.
+# cost one record of the budget.
 MAX_VALUES, _VALUES_PER_RECORD = 4_000_000, 16
 
 
@@ -39,15 +39,15 @@ def deserialise(
 ) -> Any:
     """Reads a message from CDR bytes; its arrays are read-only views of `data`.
 
-    Bytes after the message are ignored, as in ROS: recorders that use `serialize_message` append
-    some.
+    Bytes after the message are ignored, as in ROS, because recorders that use `serialize_message`
+    append some.
 
     Args:
         data: CDR bytes with encapsulation header, in either byte order.
         msgtype: type, for example 'hmt_msgs/msg/Body'.
-        types: types that contain it; None: `typestore()`.
-        budget: budget of the file of the bytes, because each untrusted byte may claim to be a
-            message, for which an object is made.
+        types: types that include `msgtype`; None selects `typestore()`.
+        budget: budget of the file that contains the bytes, because a few untrusted bytes can claim
+            to be many messages, each of which becomes an object.
 
     Raises:
         Exception: the bytes are not a message of this type; any class of exception is possible.
@@ -63,7 +63,9 @@ def deserialise(
         extent = _extent_of_type(store, msgtype)
         values = extent.values + int(extent.density * len(body))
         if values > MAX_VALUES:
-            raise ValueError(f'{len(view)} bytes may hold {values} values, wanted {MAX_VALUES}')
+            raise ValueError(
+                f'{len(view)} bytes may hold {values} values, wanted at most {MAX_VALUES}'
+            )
         budget.spend(records=values // _VALUES_PER_RECORD)
     message, end = read(body, 0, definition.cls, store)
     if end > len(body):

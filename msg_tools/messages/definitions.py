@@ -1,8 +1,8 @@
 """Reads untrusted message definitions in the .msg language of ROS 2.
 
-Only names and types of fields are read, which CDR needs; constants, defaults and comments are
-skipped. The time is linear in the length of the text. Definitions that are too large are refused
-before code is generated from them.
+Only names and types of fields are read, because CDR needs no more; constants, defaults and comments
+are skipped. The time is linear in the length of the text. Definitions that are too large are
+refused before code is generated from them.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ _ALIASES = {
 
 
 def types_of_definition(text: str, msgtype: str) -> Types:
-    """The types of a definition, including those of the nested types after it.
+    """The types in a definition, including the nested types that follow it.
 
     Args:
         msgtype: type with its package.
 
     Raises:
-        ValueError: the text is too long or invalid; one line.
+        ValueError: the text is too long or invalid; the error is one line.
     """
     if len(text) > MAX_BYTES:
         raise ValueError(f'its definition has more than {MAX_BYTES} characters')
@@ -64,10 +64,10 @@ def types_of_definition(text: str, msgtype: str) -> Types:
 
 
 def check_types(types: Types, known: Mapping[str, Any]) -> None:
-    """Raises ValueError of one line if types are too large or can not be used.
+    """Raises ValueError (one line) if types are too large or can not be used.
 
     Args:
-        known: types that they may use, by name; the second item of each is its fields.
+        known: types for nested fields, by name; the second item of each is its fields.
     """
     fields = [kind for each in types.values() for _, kind in each]
     if len(types) + len(fields) > MAX_FIELDS:
@@ -90,7 +90,7 @@ class Extent(NamedTuple):
     """Minimum extent of a field, with all its sequences empty.
 
     Attributes:
-        values: number of values, for which objects are made; an array of numbers is one value.
+        values: number of values, each a Python object; an array of numbers is one value.
         size: size, bytes.
         density: maximum number of values per byte in its sequences.
         levels: number of levels of nested messages.
@@ -109,8 +109,8 @@ def extent_of(
 
     Args:
         types: types by name; the second item of each is its fields.
-        extents: known extents of types, to which new ones are added.
-        level: number of messages around the field.
+        extents: known extents by type; new extents are added.
+        level: number of messages in which the field is nested.
 
     Raises:
         ValueError: an unknown type, or one that is nested too deeply, for example in itself.

@@ -1,11 +1,12 @@
 """People in the messages of detectors: identities, keypoints, boxes.
 
 - hmt_msgs/People2D: people with keypoints of any names, boxes, or both, with or without an id.
-- hri_msgs/Skeleton2D (REP 155): one person, 18 landmarks in units of the image.
-- yolo_msgs/DetectionArray (yolo_ros): people with an id, landmarks that are numbered from 1.
-- std_msgs/Float32MultiArray: rows u, v or u, v, confidence, px, of one person, or of several in an
-  additional outermost dimension. The label of the outermost dimension may be the image stamp, ns.
-- vision_msgs/Detection2DArray: people with an id and a box, and no keypoints.
+- hri_msgs/Skeleton2D (REP 155): one person, 18 landmarks in units of image width and height.
+- yolo_msgs/DetectionArray (yolo_ros): people with an id and landmarks, numbered from 1.
+- std_msgs/Float32MultiArray: rows (u, v) or (u, v, confidence), px, of one person; several people
+  have an additional outermost dimension. The label of the outermost dimension can be the image
+  stamp, ns.
+- vision_msgs/Detection2DArray: people with an id and a box, but without keypoints.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ PERSON_CLASSES = ('person', 'people', 'human', 'pedestrian', '0', '')
 MAX_PEOPLE = 1000
 
 
-# Keypoints where nobody was seen, or of a detector without keypoints.
+# Empty keypoints, if nobody was seen or the detector finds no keypoints.
 NO_KEYPOINTS = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 
 
@@ -81,7 +82,7 @@ def person_of_skeleton(message: Any, width: int, height: int) -> DetectedPerson:
         raise MessageError(f'Skeleton2D has {len(message.skeleton)} points, wanted {wanted}')
     rows = np.array([(p.x, p.y, p.c) for p in message.skeleton], dtype=np.float64)
     rows[(rows[:, :2] == 0).all(1)] = np.nan, np.nan, 0.0
-    # In the message (0, 0) is the corner of the first pixel; here it is its centre.
+    # In the message (0, 0) is the corner of the first pixel; in results it is the pixel's centre.
     rows[:, :2] = rows[:, :2] * (width, height) - 0.5
     return _person('', scheme, rows)
 
@@ -93,8 +94,8 @@ def people_of_message(message: Any, sigma_px: float = 0.0) -> list[DetectedPerso
         sigma_px: see `keypoints_of`.
 
     Raises:
-        MessageError: the number of keypoints or boxes differs from that of the people, or
-            `keypoints_of` refuses keypoints.
+        MessageError: people, keypoints and boxes differ in number, or `keypoints_of` rejects
+            keypoints.
     """
     n = len(message.ids)
     _check_count(n)
@@ -118,7 +119,7 @@ def people_of_message(message: Any, sigma_px: float = 0.0) -> list[DetectedPerso
 def people_message(
     messages: MessageFactory, people: Sequence[DetectedPerson], stamp_ns: int, frame_id: str
 ) -> Any:
-    """hmt_msgs/People2D of the people in an image with a stamp."""
+    """Makes an hmt_msgs/People2D of the people in an image."""
     boxes = []
     for person in people:
         left, top, right, bottom = (0, 0, 0, 0) if person.box is None else person.box
@@ -168,11 +169,11 @@ def people_of_yolo(message: Any, scheme: Scheme) -> list[DetectedPerson]:
     """The people with keypoints in a yolo_msgs/DetectionArray.
 
     Args:
-        scheme: scheme whose order numbers the keypoints.
+        scheme: scheme in whose order the keypoints are numbered.
 
     Raises:
-        MessageError: a number that the scheme does not have, a number that occurs twice, or invalid
-            positions.
+        MessageError: a keypoint number that the scheme lacks, a number that occurs twice, or
+            invalid positions.
     """
     _check_count(len(message.detections))
     people = []
@@ -200,8 +201,8 @@ def people_of_floats(message: Any, scheme: Scheme) -> list[DetectedPerson]:
     """The people in a std_msgs/Float32MultiArray.
 
     Args:
-        message: array (n, 2) or (n, 3), or (people, n, 2) or (people, n, 3); one person without
-            dimensions. An empty array means that nobody was seen.
+        message: array (n, 2), (n, 3), (people, n, 2) or (people, n, 3); without dimensions it is
+            one person. An empty array means that nobody was seen.
         scheme: scheme with n landmarks, in the order of the rows.
 
     Raises:
@@ -229,7 +230,7 @@ def people_of_floats(message: Any, scheme: Scheme) -> list[DetectedPerson]:
 
 
 def stamp_of_floats(message: Any) -> int | None:
-    """The image stamp in a std_msgs/Float32MultiArray, ns; None if it has none."""
+    """The image stamp in a std_msgs/Float32MultiArray, ns; None if missing."""
     dimensions = message.layout.dim
     label = str(dimensions[0].label) if len(dimensions) else ''
     return int(label) if label.isascii() and label.isdigit() and len(label) < 20 else None

@@ -27,7 +27,7 @@ class GroundState:
     Attributes:
         stamp_ns, frame_id: stamp of the image, and optical frame of the camera.
         up: (3,) unit vector opposite to gravity.
-        up_sigma: standard deviation of its direction, rad; NaN if unknown.
+        up_sigma: standard deviation of the direction of `up`, rad; NaN if unknown.
         height: height of the camera above the floor, m; None if unknown.
         height_sigma: standard deviation of the height, m; NaN if unknown.
         contacts: probability that a foot is on the floor, by its name, for example left_foot.
@@ -84,7 +84,7 @@ def ground_message(messages: MessageFactory, content: GroundState) -> Any:
 
 
 def ground_of(message: Any) -> GroundState:
-    """The content of an hmt_msgs/Ground, of `rosbags` or of ROS.
+    """Reads an hmt_msgs/Ground message of `rosbags` or of ROS.
 
     Raises:
         MessageError: values that contradict each other or are out of range.

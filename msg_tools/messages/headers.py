@@ -11,7 +11,7 @@ from msg_tools.messages.message_types import MessageFactory
 SECOND_NS = 1_000_000_000
 FRAME_ID = 'camera_optical_frame'  # default frame of a camera
 START_NS = 1_700_000_000 * SECOND_NS  # default stamp of the first image
-EARLIEST_NS = -(2**31) * SECOND_NS  # earliest time of a message
+EARLIEST_NS = -(2**31) * SECOND_NS  # earliest time that a message can contain
 _STAMP_AT, _STAMP_SIZE = 4, 8  # offset and size of the stamp in CDR, bytes
 
 
@@ -35,7 +35,7 @@ def time_ns(time: Any) -> int:
 
 
 def stamp_in(data: bytes) -> int:
-    """Stamp, ns, of the header at the start of a message in CDR bytes; 0 if it has none."""
+    """Stamp, ns, of the header at the start of a message in CDR bytes; 0 if invalid."""
     # After the encapsulation, whose second byte gives the byte order.
     if len(data) < _STAMP_AT + _STAMP_SIZE:
         return 0

@@ -31,10 +31,10 @@ _LANDMARK = 'hri_msgs/msg/NormalizedPointOfInterest2D'
 # Extent of the body around a joint (flesh, skull, fingers), m.
 REACH = 0.12
 # Rotation from the axes of the head's landmarks (x to the person's right, y backwards, z down) to
-# those of the reference model.
+# the axes of the reference model.
 _OF_HEAD = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-# Maximum distance at which modes agree on a landmark or a corner of the region, in heights of the
-# region.
+# Maximum difference of a landmark, or of a side of the region, between modes that agree, in heights
+# of the region.
 _AGREE = 0.1
 
 
@@ -44,7 +44,7 @@ def ids_message(messages: MessageFactory, ids: Sequence[str], stamp_ns: int) -> 
 
 
 def region_in_image(camera: Camera, positions: Array) -> Array | None:
-    """Left, top, right and bottom (4,) of a person in an image, px from its upper left corner.
+    """Left, top, right and bottom (4,) of a person, px from the upper left corner of the image.
 
     Args:
         positions: (J, 3) positions of the joints in the frame of the camera, m.
@@ -77,9 +77,9 @@ def region_message(
 
     Args:
         region: (4,) region of the shown mode, see `region_in_image`.
-        others: (K) regions of all modes.
-        weights: (K,) weights of the modes. The confidence is the probability that each side is
-            within a tenth of the height of the region from the shown one.
+        others: K regions, of all modes.
+        weights: (K,) weights of the modes. The confidence is the sum of the weights of modes whose
+            sides differ by at most a tenth of the region's height from the shown sides.
     """
     near = _AGREE * (region[3] - region[1])
     agree = [other is not None and np.abs(other - region).max() <= near for other in others]
@@ -105,7 +105,7 @@ def skeleton_message(
 
     Landmarks that are unknown or outside of the image are at (0, 0) with confidence 0. The
     confidence of any other landmark is the probability that it is near its shown position, within a
-    tenth of the height of all landmarks.
+    tenth of the height of the whole skeleton in the image.
 
     Args:
         landmarks: (K, 18, 3) landmarks in all modes, see `landmarks_in_space`.
@@ -133,8 +133,8 @@ def landmarks_in_space(
 ) -> Array:
     """Landmarks (K, 18, 3) of Skeleton2D in the frame of the joint positions (K, J, 3), m.
 
-    Landmarks of limbs are their joints. Nose and ears are at the positions that detectors give them
-    on a head with the rotation of the reference model. Eyes are unknown, NaN.
+    Landmarks of limbs are their joints. Nose and ears have the offsets from the head that detectors
+    give them, rotated like the head of the reference model. Eyes are unknown, NaN.
     """
     marks = schemes()['skeleton2d'].landmarks
     names, rotations, _ = human.links()

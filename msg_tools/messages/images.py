@@ -1,7 +1,7 @@
 """Converts sensor_msgs/Image and sensor_msgs/CompressedImage to arrays and back.
 
 A decoded picture is always BGR, uint8, (H, W, 3), contiguous and writable. Messages of `rosbags`
-and of ROS are both accepted: the data may be any buffer of bytes.
+and of ROS are both accepted: the data can be any buffer of bytes.
 
 A depth image is registered to a colour image of the same size: each value is the depth of the
 surface at that pixel, along the axis of the camera (REP 118). `16UC1` is in mm, 0 without
@@ -30,14 +30,13 @@ Depth = NDArray[np.float32]
 MAX_PIXELS = 2**26
 
 _PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
-# Offsets of size and bits per channel in the header of a PNG, bytes; the colour type follows, 0 is
+# Byte offsets of the size and of the bit depth in a PNG; the next byte is the colour type, 0 for
 # grey.
 _PNG_SIZES, _PNG_DEPTH = 16, 24
 # Chunks of a PNG that are kept; texts, profiles and animations could unpack to any size.
 _PNG_CHUNKS = b'IHDR', b'PLTE', b'tRNS', b'IDAT', b'IEND'
 
-# Start of a JPEG, and maximum number of segments before the frame header, whose markers are
-# `_JPEG_FRAMES`.
+# Start of a JPEG, and maximum number of segments before its frame header.
 _JPEG_START, _MAX_JPEG_SEGMENTS = b'\xff\xd8', 1000
 _JPEG_SEGMENT = re.compile(rb'\xff+([\xc0-\xcf\xdb-\xfe])(..)', re.DOTALL)
 _JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
@@ -46,20 +45,20 @@ _JPEG_SCAN, _JPEG_END = b'\xff\xda', b'\xff\xd9'
 MAX_JPEG_SCANS = 100
 _MAX_SCANNED = 16 * MAX_PIXELS  # maximum number of pixels of all scans
 
-# Limits of compression: JPEG needs at least one bit per block of 8x8 pixels, deflate one byte per
-# 1032 bytes, each of which may be 8 pixels of a PNG.
+# Limits of compression: JPEG needs at least one bit per block of 8x8 pixels. Deflate needs at least
+# one byte per 1032 bytes, and one byte of a PNG is at most 8 pixels.
 _JPEG_PIXELS_PER_BYTE = 512
 _PNG_PIXELS_PER_BYTE = 8 * 1032
-# Number of pixels that every file may have, and more per byte of the file, so that small files of
-# one colour can not occupy a reader for minutes.
+# Number of pixels allowed in every file, and additional pixels per byte of the file. Otherwise
+# small files of one colour could occupy a reader for minutes.
 FREE_PIXELS, _PIXELS_PER_BYTE = 2**24, 16
-# Maximum size of a PNG per pixel (four incompressible channels of 16 bits) and in addition, bytes;
-# all data would be inflated.
+# Maximum size of a PNG, bytes: a part per pixel (four incompressible channels of 16 bits), and a
+# constant. Surplus data would be inflated, too.
 _PNG_BYTES_PER_PIXEL, _PNG_BYTES = 9, 10_000
 
 
 class ImageError(ValueError):
-    """A picture can not be decoded; one line with the value seen and the value wanted."""
+    """A picture can not be decoded; the text is one line with the values seen and wanted."""
 
 
 # Encoding: (dtype, channels, conversion to BGR or None). OpenCV names Bayer patterns after the
@@ -99,11 +98,11 @@ _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     'nv21': ('u1', 1, cv2.COLOR_YUV2BGR_NV21),
 }
 _MASKS = ('mono8', '8UC1')
-# Encodings with chroma rows of half the height after the picture.
+# Encodings with chroma after the picture, in half as many rows.
 _PLANAR = ('nv12', 'nv21', 'yuv420', 'i420', 'yv12')
-# Encodings with chroma rows of half the width, one plane after the other.
+# Encodings with two separate chroma planes, in rows of half the width.
 _THREE_PLANES = ('yuv420', 'i420', 'yv12')
-# Encodings in which two neighbours share their chroma.
+# Encodings in which two neighbouring pixels share their chroma.
 _EVEN_WIDTH = ('yuv422', 'uyvy', 'yuv422_yuy2', 'yuyv', 'yvyu', *_PLANAR)
 # Encoding: (dtype, units per metre). Some drivers write mono16 for 16UC1.
 _DEPTH_ENCODINGS = {'16UC1': ('u2', 1000), 'mono16': ('u2', 1000), '32FC1': ('f4', 1)}
@@ -112,11 +111,11 @@ _DEPTH_ENCODINGS = {'16UC1': ('u2', 1000), 'mono16': ('u2', 1000), '32FC1': ('f4
 def decode_image(message: Any) -> Picture:
     """The picture of an Image or a CompressedImage, BGR (H, W, 3).
 
-    16-bit pictures are scaled to 8 bits, grey ones get three equal channels, and alpha is dropped.
+    16-bit pictures are scaled to 8 bits, grey pictures get three equal channels, alpha is dropped.
     The orientation in a JPEG is ignored, because the calibration is for the stored picture.
 
     Raises:
-        ImageError: unknown encoding, contradictory sizes, or bytes that are no picture.
+        ImageError: unknown encoding, contradictory sizes, or bytes that are not a picture.
     """
     if hasattr(message, 'encoding'):
         return _decode_raw(message)
@@ -177,13 +176,13 @@ def _rows_of(message: Any, rows: int, row_bytes: int, what: str = 'image') -> Pi
 
 
 def decode_mask(message: Any) -> Mask:
-    """The mask (H, W) of an Image, `mono8` or `8UC1`, or of a CompressedImage, a grey PNG.
+    """Decodes the mask (H, W) in an Image (`mono8` or `8UC1`) or a CompressedImage (grey PNG).
 
     True where the value is not zero. A JPEG is refused, because it blurs the outline of the mask
     and changes zeros.
 
     Raises:
-        ImageError: another encoding, contradictory sizes, or bytes that are no picture.
+        ImageError: another encoding, contradictory sizes, or bytes that are not a picture.
     """
     if hasattr(message, 'encoding'):
         encoding = str(message.encoding)
@@ -218,8 +217,8 @@ def decode_picture(
         colours: flag of OpenCV for the channels of the picture.
 
     Raises:
-        ImageError: another format, a damaged file, more pixels than `MAX_PIXELS`, or more than is
-            possible or allowed for the size of the file.
+        ImageError: another format, a damaged file, more pixels than `MAX_PIXELS`, or too many
+            pixels for the size of the file.
     """
     if content.startswith(b'\xff\xd8\xff'):
         width, height = _jpeg_size(content)
@@ -299,7 +298,7 @@ def _plain_png(content: bytes) -> bytes:
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int]:
-    """Width and height of a complete JPEG file; a decoder would invent missing parts."""
+    """Width and height of a JPEG file; raises ImageError if the file is incomplete."""
     what = f'jpeg of {len(content)} bytes'
     found = _JPEG_SEGMENT.match(content, len(_JPEG_START))
     for _ in range(_MAX_JPEG_SEGMENTS):
@@ -311,7 +310,7 @@ def _jpeg_size(content: bytes) -> tuple[int, int]:
         raise ImageError(f'{what} breaks off or is damaged: its size is missing')
     height, width = struct.unpack_from('>HH', content, found.end() + 1)
     _check_size(width, height)
-    # Within a scan a byte ff is never followed by the number of one of these markers.
+    # Scan data never contain these two markers: a byte ff is never followed by their codes.
     scans = content.count(_JPEG_SCAN)
     most = min(MAX_JPEG_SCANS, _MAX_SCANNED // (width * height + 1))
     if scans > most:

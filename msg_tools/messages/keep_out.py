@@ -34,7 +34,7 @@ _POINT = 1e-6
 
 
 class KeepOutState(IntEnum):
-    """State of the person; the constants of hmt_msgs/KeepOut."""
+    """State of the person; values as in KeepOut.msg."""
 
     UNKNOWN = 0
     TRACKING = 1
@@ -50,12 +50,12 @@ class KeepOut:
     Attributes:
         stamp_ns, frame_id: time of the state, and frame of the capsules.
         state: state of the person.
-        starts, ends: (N, 3) ends of the axes of capsules, m.
+        starts, ends: (N, 3) end points of the axes of the capsules, m.
         radii: (N,) radii of the capsules, m.
-        track_id: number of the track; 0 for none.
+        track_id: number of the track; 0 if missing.
         existence_probability: probability that a person is in view; NaN if unknown.
-        unseen: time since the last image that showed the person, s; NaN if none did.
-        probability: requested probability, for each part of the person and for the modes.
+        unseen: time since the last image that showed the person, s; NaN if no image did.
+        probability: requested probability that the capsules contain the person, see KeepOut.msg.
         reason: reason why the state is unknown; '' if it is known.
 
     Raises:
@@ -106,7 +106,7 @@ def keep_out_message(messages: MessageFactory, content: KeepOut) -> Any:
 
 
 def keep_out_of(message: Any) -> KeepOut:
-    """The content of an hmt_msgs/KeepOut, of `rosbags` or of ROS.
+    """Reads an hmt_msgs/KeepOut message of `rosbags` or of ROS.
 
     Raises:
         MessageError: values that contradict each other or are out of range.
@@ -132,10 +132,10 @@ def keep_out_of(message: Any) -> KeepOut:
 
 
 def collision_shapes(messages: MessageFactory, content: KeepOut) -> tuple[list[Any], list[Any]]:
-    """Converts capsules for planners without capsules: a cylinder with a sphere at each end.
+    """Converts each capsule to a cylinder and two spheres, for planners without capsules.
 
     Returns:
-        shape_msgs/SolidPrimitive and geometry_msgs/Pose of each, for a
+        shape_msgs/SolidPrimitive and geometry_msgs/Pose of each part, for a
         moveit_msgs/CollisionObject.
     """
     solids, poses = [], []

@@ -36,7 +36,7 @@ class Positions:
 
     Attributes:
         names: (n,) names of the landmarks.
-        positions: (n, 3) m, along the axes of the camera from a common origin; NaN if unknown.
+        positions: (n, 3) positions along the camera axes from a common origin, m; NaN if unknown.
     """
 
     names: tuple[str, ...]
@@ -53,19 +53,19 @@ class Positions:
 
 
 def keypoints_of(message: Any, sigma_px: float = 0.0) -> Keypoints:
-    """The content of an hmt_msgs/Keypoints2D, of `rosbags` or of ROS.
+    """Reads an hmt_msgs/Keypoints2D message of `rosbags` or of ROS.
 
     Args:
         sigma_px: standard deviation of keypoints without covariance, px; 0 if unknown.
 
     Returns:
-        The keypoints, empty if nobody was seen. Unseen ones have NaN as pixels, and confidence 0.
+        The keypoints, empty if nobody was seen. Unseen keypoints have pixels NaN and confidence 0.
         Unknown covariances are NaN.
 
     Raises:
-        MessageError: a name that occurs twice, contradictory lengths of arrays, a position beyond
-            all images or with only one coordinate, a covariance that is not positive definite, or
-            a confidence outside of [0, 1].
+        MessageError: a name that occurs twice, contradictory lengths of arrays, a position far
+            outside of any image or with only one coordinate, a covariance that is not positive
+            definite, or a confidence outside of [0, 1].
     """
     names, pixels, confidences = _points_of(message, 'uv', 'keypoints')
     n = len(names)
@@ -82,13 +82,14 @@ def keypoints_of(message: Any, sigma_px: float = 0.0) -> Keypoints:
 def checked_keypoints(
     names: tuple[str, ...], pixels: Array, confidences: Array, covariances: Array | None = None
 ) -> Keypoints:
-    """Checks the keypoints of a detector, and clears the other values of unseen ones.
+    """Checks the keypoints of a detector, and clears the values of unseen keypoints.
 
     Args:
         names: (n,) distinct names.
-        pixels: (n, 2) px; changed in place, like the other arrays.
+        pixels: (n, 2) image positions, px; all arrays are changed in place.
         confidences: (n,) confidences, 0 to 1.
-        covariances: (n, 2, 2) px^2; NaN if unknown for a keypoint, None if unknown for all.
+        covariances: (n, 2, 2) covariances of the pixels, px^2; NaN for a keypoint if unknown, None
+            if all are unknown.
 
     Raises:
         MessageError: see `keypoints_of`.
@@ -107,7 +108,7 @@ def checked_keypoints(
 
 
 def positions_of(message: Any) -> Positions:
-    """The content of an hmt_msgs/Keypoints3D, of `rosbags` or of ROS.
+    """Reads an hmt_msgs/Keypoints3D message of `rosbags` or of ROS.
 
     A landmark has a position unless its confidence is 0; the confidence has no other effect. The
     result is empty if nobody was seen.
@@ -126,11 +127,11 @@ def positions_of(message: Any) -> Positions:
 def keypoints_message(
     messages: MessageFactory, keypoints: Keypoints, stamp_ns: int, frame_id: str
 ) -> Any:
-    """hmt_msgs/Keypoints2D of an image with a stamp, in the optical frame of its camera.
+    """Makes an hmt_msgs/Keypoints2D of the keypoints in an image.
 
     Args:
         keypoints: keypoints, empty if nobody was seen. Unknown covariances are NaN; the message has
-            none if all are unknown.
+            no covariances if all are unknown.
         frame_id: optical frame of the camera.
     """
     known = bool(np.isfinite(keypoints.covariances).any())
@@ -148,7 +149,7 @@ def keypoints_message(
 def positions_message(
     messages: MessageFactory, keypoints: Keypoints, stamp_ns: int, frame_id: str
 ) -> Any:
-    """hmt_msgs/Keypoints3D of keypoints; empty if they have no positions."""
+    """Makes an hmt_msgs/Keypoints3D of keypoints; it is empty if they have no positions."""
     names, positions = list(keypoints.names), keypoints.positions
     confidences = keypoints.confidences
     if positions is None:

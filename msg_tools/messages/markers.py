@@ -2,7 +2,7 @@
 
 A mode of rank k (0 for the heaviest) has the namespace `mode_k` with two markers, 0 the bones and 1
 the joints; lighter modes are fainter. A viewer thus replaces earlier markers. Every array contains
-all ranks, and deletes the markers of unused ones.
+all ranks, and deletes the markers of unused ranks.
 
 The floor is a translucent square in the namespace `floor`. Feet on the floor are spheres in the
 namespace `contacts`; less probable contacts are fainter. Markers of unknown objects are deleted.
@@ -34,14 +34,14 @@ _OTHERS = (0.10, 0.45, 0.80)
 _FAINTEST = 0.12
 
 FLOOR, CONTACTS = 'floor', 'contacts'
-# Side and thickness of the square, whose top is the floor, m.
+# Side and thickness of the floor marker, m; its top is the floor.
 _SIDE, _THICK = 3.0, 0.005
 _FLOOR_COLOUR = (0.55, 0.55, 0.50), 0.30
 _CONTACT_COLOUR = (0.00, 0.62, 0.45)
 _SPHERE = 0.09  # diameter, m
-# Minimum probability of a contact that is shown.
+# Minimum probability of a shown contact.
 _LEAST = 0.05
-# Suffixes of the names of the joints of a foot.
+# Suffixes of the joint names of a foot.
 _OF_FOOT = ('ankle', 'toe')
 
 
@@ -62,11 +62,11 @@ def skeleton_markers(
     """visualization_msgs/MarkerArray of K modes.
 
     Args:
-        joint_positions: (K, J, 3) m.
+        joint_positions: (K, J, 3) joint positions, m.
         edges: bones, as pairs of joint names.
         weights: (K,) weights of the modes, in any order.
         ranks: maximum number of shown modes; the lightest are left out.
-        bone_width, joint_diameter: sizes, m.
+        bone_width, joint_diameter: width of bones and diameter of joints, m.
 
     Raises:
         MessageError: contradictory shapes of arrays, or an edge with an unknown joint.
@@ -109,11 +109,11 @@ def trajectory_markers(
 ) -> Any:
     """visualization_msgs/MarkerArray of M trajectories: paths of some joints and the newest pose.
 
-    Like `skeleton_markers`: a trajectory of rank k has the namespace `trajectory_k`, with the paths
-    as marker 0 and the newest pose as marker 1.
+    As in `skeleton_markers`, a trajectory of rank k has the namespace `trajectory_k`, with the
+    paths as marker 0 and the newest pose as marker 1.
 
     Args:
-        joint_positions: (M, T, J, 3) m, in temporal order.
+        joint_positions: (M, T, J, 3) joint positions in temporal order, m.
         traced: joints whose paths are drawn; unknown names are ignored.
         edges: bones, as pairs of joint names.
         weights: (M,) weights of the trajectories, in any order.
@@ -218,8 +218,9 @@ def ground_markers(
     """visualization_msgs/Marker of the floor and of the contacts of one pose.
 
     Args:
-        joint_positions: (J, 3) m, in the frame of the content; the floor is drawn below their mean.
-        joint_names: (J,) names of the joints; feet without joints of their side are left out.
+        joint_positions: (J, 3) joint positions, m, in the frame of the content; the floor is drawn
+            below their mean.
+        joint_names: (J,) names of the joints; a foot without ankle or toe is left out.
     """
     positions = np.asarray(joint_positions, dtype=np.float64)
     header = header_message(messages, content.stamp_ns, content.frame_id)
@@ -243,7 +244,7 @@ def ground_markers(
 
 
 def removed_ground(messages: MessageFactory, stamp_ns: int, frame_id: str) -> list[Any]:
-    """visualization_msgs/Marker list that deletes the markers of `ground_markers`."""
+    """List of visualization_msgs/Marker that delete the markers of `ground_markers`."""
     header = header_message(messages, stamp_ns, frame_id)
     return [_marker(messages, header, ns=name, action=_DELETE) for name in (FLOOR, CONTACTS)]
 
@@ -251,7 +252,7 @@ def removed_ground(messages: MessageFactory, stamp_ns: int, frame_id: str) -> li
 def _standing(
     content: GroundState, positions: Array, joint_names: Sequence[str]
 ) -> tuple[list[Array], list[float]]:
-    """Joints (3,) of feet that may be on the floor, m, and probabilities of contact."""
+    """Joint positions (3,) of feet with a likely floor contact, m, and contact probabilities."""
     places = {name: place for place, name in enumerate(joint_names)}
     points, shares = [], []
     for foot, probability in content.contacts.items():
@@ -265,7 +266,7 @@ def _standing(
 
 
 def _floor(messages: MessageFactory, header: Any, plane: Array, over: Array) -> Any:
-    """The square of the floor below a point (3,)."""
+    """Marker of the floor: a square below a point (3,)."""
     up, height = plane[:3], plane[3]
     across = np.eye(3)[np.argmin(np.abs(up))]
     x = across - (across * up).sum() * up

@@ -1,4 +1,4 @@
-"""`MessageError`, raised for invalid messages, and the common checks of conversions."""
+"""`MessageError` for invalid messages, and common checks in conversions of messages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SYMMETRY_TOLERANCE = 1e-9
 
 
 class MessageError(ValueError):
-    """A message is invalid; one line with the value seen and the value wanted.
+    """A message is invalid; the text is one line with the value seen and the value wanted.
 
     Attributes:
         fault: kind of the fault, in a word or two.
@@ -32,7 +32,7 @@ class MessageError(ValueError):
 
 
 def numbers(values: Any, shape: tuple[int, ...], what: str) -> Array:
-    """Converts a flat field of a message to an array of floats in a shape.
+    """Converts a flat field of a message to an array of floats with a given shape.
 
     Raises:
         MessageError: another number of values.
@@ -45,7 +45,7 @@ def numbers(values: Any, shape: tuple[int, ...], what: str) -> Array:
 
 
 def complete_mixture(record: Any, what: str) -> None:
-    """Checks names and identities of a frozen dataclass of a mixture, and sets their types.
+    """Checks names, lengths and identities of a mixture dataclass, and converts their types.
 
     Raises:
         MessageError: a name that occurs twice, a segment length that is not finite, or different
@@ -64,10 +64,10 @@ def freeze_arrays(
     """Makes attributes of a frozen dataclass read-only arrays of floats, and checks their shapes.
 
     Args:
-        optional: names of attributes that may be None.
+        optional: names of attributes for which None is allowed.
 
     Raises:
-        MessageError: another shape.
+        MessageError: an array has another shape.
     """
     for name, shape in shapes.items():
         value = getattr(record, name)
@@ -107,13 +107,13 @@ def check_once(identities: NDArray[Any], what: str) -> None:
 
 
 def constant_of(kind: type[Constant], value: Any, fault: str) -> Constant:
-    """The constant of a message with a value.
+    """The member of an enumeration with a given value.
 
     Args:
         fault: text of the error.
 
     Raises:
-        MessageError: no constant has the value.
+        MessageError: no member has the value.
     """
     try:
         return kind(int(value))
@@ -122,7 +122,7 @@ def constant_of(kind: type[Constant], value: Any, fault: str) -> Constant:
 
 
 def check_weights(weights: Array, what: str) -> None:
-    """Raises MessageError if weights are no probabilities, or do not sum to 1."""
+    """Raises MessageError if weights are negative or not finite, or do not sum to 1."""
     if not np.isfinite(weights).all() or (weights < 0).any():
         worst = weights[~(weights >= 0) | ~np.isfinite(weights)][0]
         raise MessageError(f'{what} has the weight {worst}, wanted numbers from 0 to 1', 'weights')
@@ -137,7 +137,7 @@ def check_covariances(covariances: Array, what: str, *, singular: bool = False) 
 
     Args:
         covariances: (..., d, d) covariances.
-        singular: whether they may be positive semidefinite.
+        singular: whether to accept positive semidefinite covariances.
     """
     check_finite(covariances, f'covariance of {what}')
     if covariances.size == 0:
@@ -176,7 +176,7 @@ def names_of(values: Sequence[str], what: str) -> tuple[str, ...]:
 
 
 def check_names(names: tuple[str, ...], wanted: Sequence[str] | None, what: str) -> None:
-    """Raises MessageError if names differ from the wanted ones or their order; None skips this."""
+    """Raises MessageError if names or their order are not as wanted; None accepts any names."""
     if wanted is None or names == tuple(wanted):
         return
     if len(names) != len(wanted):
@@ -227,7 +227,7 @@ def lengths_of(message: Any, what: str) -> dict[str, float]:
 
 
 def named_numbers(message: Any, names: str, values: str, what: str) -> dict[str, float]:
-    """The numbers in a field of a message, by the names in another field; may be empty.
+    """The numbers in one field of a message, by the names in another field; both can be empty.
 
     Raises:
         MessageError: a name that occurs twice, or different numbers of values and names.

@@ -1,8 +1,8 @@
-"""Message types for use without ROS, and one interface to make messages of both kinds of classes.
+"""Message types for use without ROS, and an interface to make messages of `rosbags` or of ROS.
 
-The types are those of ROS 2 Jazzy and hmt_msgs. The .msg files in `hmt_msgs/` are their only
-definition: colcon generates the classes of the nodes from them, and this module the classes that
-`rosbags` serialises.
+The types are from ROS 2 Jazzy and hmt_msgs. The .msg files in `hmt_msgs/` are the only definition
+of hmt_msgs: colcon generates the classes of the nodes from them, and this module generates the
+classes that `rosbags` serialises.
 
 Offline code uses the classes of `rosbags`, which have numpy arrays and need a value for every
 field. Nodes use the classes that ROS generates, which have sequences of type `array.array`.
@@ -62,15 +62,16 @@ def register_definitions(package: str, folder: Path) -> None:
 
 
 def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typestore:
-    """Types for messages that have their own definition, such as those of a bag.
+    """Types for messages that have their own definition, such as messages of a bag.
 
     A bag may contain unknown types, or an older version of a known type; its messages must be read
     with its own definition.
 
     Args:
         msgtype: type, for example 'sensor_msgs/msg/Image'.
-        encoding: 'ros2msg'; for known types, another or '' selects the known definition.
-        definition: text of the definition, including those of the nested types.
+        encoding: encoding of the definition, 'ros2msg'; for a known type any other value selects
+            the known definition.
+        definition: text of the definition, including the definitions of nested types.
 
     Returns:
         The types; `typestore()` itself if it agrees with the definition.
@@ -111,7 +112,7 @@ def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typ
 
 
 def _same_fields(name: str, types: Types, known: Typestore) -> bool:
-    """Whether a type has the same fields as the known type of its name.
+    """Whether a type has the same fields as the known type of the same name.
 
     Names are compared without case, because CameraInfo had D, K, R, P in early ROS 2 releases.
     """
@@ -122,16 +123,16 @@ def _same_fields(name: str, types: Types, known: Typestore) -> bool:
 
 
 def adopted(value: Any, types: Typestore) -> Any:
-    """Converts a message of an older definition of its type to one of `typestore()`.
+    """Converts a message that has an older definition to its type in `typestore()`.
 
     Missing fields are zero or empty.
 
     Args:
         value: the message, or the value of one of its fields.
-        types: types with which it was read.
+        types: types with which the message was read.
 
     Raises:
-        ValueError: a field that the type of `typestore()` does not have.
+        ValueError: the type in `typestore()` lacks a field of the message.
     """
     if isinstance(value, list):
         return [adopted(item, types) for item in value]
@@ -149,7 +150,7 @@ _POINT = 'geometry_msgs/msg/Point'
 
 
 class MessageFactory(Protocol):
-    """Makes messages given the name of their type, for example 'hmt_msgs/msg/PoseMixture'."""
+    """Makes messages by the name of their type, for example 'hmt_msgs/msg/PoseMixture'."""
 
     def create(self, msgtype: str, **fields: Any) -> Any:
         """Makes a message; fields that are not given are zero or empty (identity for quaternions).
@@ -158,7 +159,7 @@ class MessageFactory(Protocol):
         """
 
     def points(self, positions: NDArray[np.float64]) -> list[Any]:
-        """Makes geometry_msgs/Point of positions (N, 3), faster than calls of `create`."""
+        """Makes a geometry_msgs/Point for each position (N, 3), faster than `create`."""
 
 
 class RosbagsMessages:
@@ -168,7 +169,7 @@ class RosbagsMessages:
         """See `MessageFactory.create`.
 
         Raises:
-            TypeError: a field that the type does not have.
+            TypeError: the type has no such field.
         """
         defaults = _defaults(msgtype)
         if not fields.keys() <= defaults.keys():
@@ -241,7 +242,7 @@ _TYPE_CODES = {
 
 
 def _sequence(value: NDArray[Any], kind: str) -> Any:
-    """The array type that a generated class accepts without a check of every element."""
+    """Converts to `array.array`, which generated classes accept without checking each element."""
     code = _TYPE_CODES[kind.removeprefix('sequence<').removesuffix('>').partition(',')[0]]
     result = array.array(code)
     result.frombytes(np.ascontiguousarray(value, dtype=code).tobytes())
@@ -258,7 +259,7 @@ _ZEROS: dict[str, Callable[[], Any]] = {
 
 @cache
 def _defaults(msgtype: str) -> dict[str, tuple[Callable[[], Any], str | None]]:
-    """Factory of the default of each field, and its dtype if it is an array of numbers."""
+    """Default factory of each field, and the dtype if the field is an array of numbers."""
     result: dict[str, tuple[Callable[[], Any], str | None]] = {}
     fields: Any = typestore().fielddefs[msgtype][1]
     for name, (kind, detail) in fields:

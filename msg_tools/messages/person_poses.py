@@ -1,12 +1,12 @@
 """The pose of a person: position, heading and their covariance.
 
 geometry_msgs/PoseWithCovarianceStamped gives the direction that a person faces. The frame of a
-person has its origin in the pelvis, x forward, y left, z towards the head (REP 103). Its pose is
-that of the heaviest component, and the covariance is that of the mixture about it,
+person has its origin in the pelvis, x forward, y left, z towards the head (REP 103). The pose is
+from the heaviest component, and the covariance is that of the mixture about this pose,
 
     S = sum_k w_k (S_k + e_k e_k'),    e_k = (p_k - p_0, log R_k R_0')
 
-so that it is wide if the components disagree. Rotations are about the fixed axes of the frame of
+so that it is large if the components disagree. Rotations are about the fixed axes of the frame of
 the header, as the message defines them.
 """
 
@@ -38,7 +38,7 @@ class PersonPose(NamedTuple):
 
     Attributes:
         position: (3,) position of the pelvis, m.
-        rotation: (3, 3) rotation from the frame of the person.
+        rotation: (3, 3) rotation from the frame of the person to the frame of the position.
         covariance: (6, 6) covariance of the position, m, and rotation about fixed axes, rad.
     """
 
@@ -69,7 +69,7 @@ def person_pose(body: Body, mixture: GaussianMixture) -> PersonPose:
     frames = forward(body.skeleton, mixture.means)
     places = frames.origins[0].T
     turns = product(frames.columns[0].transpose(2, 1, 0), _PERSON_IN_PELVIS)
-    # Jacobians of position and rotation of the root by its degrees of freedom.
+    # Jacobians of position and rotation of the root with respect to its degrees of freedom.
     jacobians = np.zeros((len(mixture), 6, body.dimension))
     jacobians[:, :3, :3] = frames.axes[:3].transpose(2, 1, 0)
     jacobians[:, 3:, root] = frames.axes[root].transpose(2, 1, 0)

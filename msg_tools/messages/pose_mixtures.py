@@ -45,13 +45,13 @@ from msg_tools.messages.message_types import MessageFactory
 POSE_MIXTURE = 'hmt_msgs/msg/PoseMixture'
 # Maximum number of components; a message with millions would block its reader.
 MAX_COMPONENTS = 1024
-# Arrays that only likelihoods have, and arrays of joints; both may be unknown.
+# Optional arrays of likelihoods, and optional arrays of joints.
 OF_LIKELIHOODS = ('shape_covariance', 'posterior_weights', 'ancestry')
 OF_JOINTS = ('joint_covariances', 'joint_covariances_relative', 'joint_velocities')
 
 
 class MixtureKind(IntEnum):
-    """The density that a mixture represents; the constants of PoseMixture.msg."""
+    """Kind of density that a mixture represents; values as in PoseMixture.msg."""
 
     POSTERIOR = 0
     LIKELIHOOD = 1
@@ -62,7 +62,7 @@ class MixtureKind(IntEnum):
 
 
 class TrackState(IntEnum):
-    """State of the person in view; the constants of PoseMixture.msg."""
+    """Tracking state of a person; values as in PoseMixture.msg."""
 
     UNKNOWN = 0
     TRACKING = 1
@@ -72,46 +72,48 @@ class TrackState(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class PoseMixture:
-    """The content of the message: K components over d degrees of freedom.
+    """Content of a PoseMixture message: K components over d degrees of freedom.
 
     Attributes:
         weights: (K,) weights that sum to 1; K = 0 if nobody was seen.
         means: (K, d) poses, m and rad.
-        covariances: (K, d, d) positive definite; None if unknown.
-        body_model: name of the body.
+        covariances: (K, d, d) covariances, positive definite; None if unknown.
+        body_model: name of the body model.
         dof_names: (d,) order of the variables.
         joint_names: (J,) order of the joints.
-        joint_positions: (K, J, 3) m, at the means, in the frame of the header.
+        joint_positions: (K, J, 3) joint positions at the means, m, in the frame of the header.
         kind: see `MixtureKind`.
         stamp_ns: stamp of the image.
         frame_id: optical frame of the camera.
         segment_lengths: segment lengths by name, m, which replace those of the body model. Empty
-            if unknown, as in messages of other publishers; the body is then that of the Body topic,
-            or else the unchanged model.
-        log_likelihoods: (K,) log p(image | mean) up to a constant; NaN if unknown, None if all are.
-        degrees_of_freedom: (K,) of Student components; 0 for Gaussian, None if all are Gaussian.
+            if unknown, as in messages of other publishers; the lengths are then from the Body
+            topic, or else from the body model.
+        log_likelihoods: (K,) log p(image | mean) up to a constant; NaN or None if unknown.
+        degrees_of_freedom: (K,) degrees of freedom of Student components; 0 for a Gaussian
+            component, None if all are Gaussian.
         state: state of the track, see `TrackState`.
         track_id: number of the track, from 1; 0 if the mixture belongs to no track.
-        identities: (K,) identities of the components, constant from image to image within a track,
-            from 1; 0 for no identity, None if no component has one.
-        joint_covariances: (K, J, 3, 3) m^2, of the joint positions; None if unknown.
-        joint_covariances_relative: (K, J, 3, 3) m^2, of the joint positions relative to the first
-            joint, whose own are 0; None if unknown.
-        joint_velocities: (K, J, 3) m/s, in the frame of the header; None if unknown.
+        identities: (K,) identities of the components, from 1, constant over the images of a track;
+            0 for no identity, None if no component has one.
+        joint_covariances: (K, J, 3, 3) covariances of the joint positions, m^2; None if unknown.
+        joint_covariances_relative: (K, J, 3, 3) covariances of the joint positions relative to the
+            first joint, m^2; None if unknown.
+        joint_velocities: (K, J, 3) joint velocities, m/s, in the frame of the header; None if
+            unknown.
         existence_probability: probability that a person is in view, given all images so far; NaN
             if unknown, as in messages of other publishers.
         cue_probabilities: probability that each image cue shows the person, by the name of the cue;
             'track' is the probability that some component is near the person. Empty if unknown;
             only posteriors of the filter have them.
-        error_share: independent fraction of the evidence of one image, in (0, 1], for a likelihood;
-            NaN if unknown.
-        error_time: correlation time of errors, s; NaN if unknown.
-        shape_covariance: (d, d) covariance of the pose errors that all images share because lengths
-            and flesh of the person are not known exactly, for a likelihood; None if unknown.
+        error_share: fraction of the evidence of one image that is independent, in (0, 1], for a
+            likelihood; NaN if unknown.
+        error_time: correlation time of the errors of images, s; NaN if unknown.
+        shape_covariance: (d, d) covariance of the pose errors that are common to all images because
+            the person's lengths and flesh are uncertain, for a likelihood; None if unknown.
         reason: reason why the pose is unknown; '' if it is known.
         posterior_weights: (K,) weights of the components given all images so far, which sum to 1,
             for a likelihood of the filter; None if unknown.
-        ancestry: (K, M) probability that each component continues component m of the previous
+        ancestry: (K, M) probability that component k continues component m of the previous
             likelihood; each row sums to 1. M = 0 for new modes; None if unknown.
         ancestry_stamp_ns: stamp of the previous likelihood; 0 if unknown or missing.
         ancestry_ids: (M,) identities of the previous likelihood; None if missing.
@@ -203,7 +205,7 @@ class PoseMixture:
             check_covariances(self.shape_covariance, 'the shape', singular=True)
 
     def _check_chain(self, ancestry_ids: NDArray[np.uint32]) -> None:
-        """Raises MessageError if posterior weights or ancestry are no probabilities."""
+        """Raises MessageError if posterior weights or ancestry are not probabilities."""
         assert self.identities is not None
         if len(self.weights) and self.posterior_weights is not None:
             check_weights(self.posterior_weights, 'mixture: posterior')
@@ -244,18 +246,18 @@ class PoseMixture:
     ) -> PoseMixture:
         """A mixture over the poses of a body with its current segment lengths.
 
-        Covariances and velocities of the joints are linearised from those of the poses,
+        Covariances and velocities of the joints are linearised functions of those of the poses,
 
             S_joint = J S J',    v_joint = J v,    J = d joint / d pose at the mean
 
-        and those relative to the pelvis, the first joint, have J - J_pelvis in place of J.
+        and the relative covariances use J - J_pelvis in place of J; the pelvis is the first joint.
 
-        The other arguments are those of the attributes.
+        For the other arguments see the attributes.
 
         Args:
-            mixture: K Gaussians over its poses; None if nobody was seen. Root angles of the message
-                are relative to the camera, even if the body is levelled.
-            joint_positions: (K, J, 3) m, of the means; None computes them.
+            mixture: K Gaussians over poses of the body; None if nobody was seen. Root angles of the
+                result are relative to the camera, even if the body is levelled.
+            joint_positions: (K, J, 3) joint positions at the means, m; None computes them.
             velocities: (K, d) velocities of the poses, per second; None if unknown.
             cue_probabilities: see the attributes; None if unknown.
 
@@ -392,16 +394,16 @@ def pose_mixture_of(
     dof_names: Sequence[str] | None = None,
     joint_names: Sequence[str] | None = None,
 ) -> PoseMixture:
-    """The content of an hmt_msgs/PoseMixture, of `rosbags` or of ROS.
+    """Reads an hmt_msgs/PoseMixture message of `rosbags` or of ROS.
 
-    A message may be without components (nobody was seen), without covariances or without segment
-    lengths (see `PoseMixture`); `PoseMixture.mixture` needs the first two.
+    A message may lack components (nobody was seen), covariances or segment lengths (see
+    `PoseMixture`); `PoseMixture.mixture` needs components and covariances.
 
     Args:
-        dof_names, joint_names: required names in this order; None accepts any.
+        dof_names, joint_names: required names in this order; None accepts any names.
 
     Raises:
-        MessageError: other names, contradictory lengths of arrays, weights that are no
+        MessageError: other names, contradictory lengths of arrays, weights that are not
             probabilities, or covariances that are not positive definite.
     """
     names = names_of(message.dof_names, 'mixture: dof_names')
@@ -462,20 +464,20 @@ def pose_mixture_of(
 
 
 def _existence(message: Any, state: TrackState) -> float:
-    """The probability of existence; NaN if a publisher has not set it, and it is 0."""
+    """Existence probability; NaN if it is 0 because the publisher has not set it."""
     value = float(message.existence_probability)
     return math.nan if state is TrackState.UNKNOWN and value == 0.0 else value
 
 
 def _errors(message: Any) -> dict[str, Any]:
-    """The error model; empty if a publisher has not set it, and it is 0."""
+    """Error model as arguments of `PoseMixture`; empty if the publisher has not set it."""
     if message.error_share == 0.0:
         return {}
     return {'error_share': float(message.error_share), 'error_time': float(message.error_time)}
 
 
 def _chain(message: Any) -> dict[str, Any]:
-    """Weights and ancestry; None if a publisher has not set them, and they are 0 or empty."""
+    """Posterior weights and ancestry by argument; None if the publisher has not set them."""
     weights = np.array([c.posterior_weight for c in message.components])
     told, ids = np.nan_to_num(weights).any(), message.ancestry_ids
     rows = array_of_each(message.components, 'ancestry', (len(ids),), 'mixture')

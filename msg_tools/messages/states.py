@@ -1,6 +1,6 @@
 """Poses for viewers and robots, as sensor_msgs/JointState and tf2_msgs/TFMessage.
 
-The names in joint states are those of the joints of the URDF.
+Joint states have the joint names of the URDF.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def joint_state_message(
     """sensor_msgs/JointState of a pose (d,) with positions only, m or rad.
 
     Raises:
-        MessageError: the number of positions differs from that of names.
+        MessageError: positions and names differ in number.
     """
     position = np.asarray(pose, dtype=np.float64)
     if position.shape != (len(dof_names),):
@@ -59,7 +59,7 @@ def quaternions(rotations: ArrayLike) -> Array:
     """Unit quaternions (N, 4), x y z w with w >= 0, of rotation matrices (N, 3, 3)."""
     r = np.asarray(rotations, dtype=np.float64)
     xx, yy, zz = np.diagonal(r, axis1=1, axis2=2).T
-    # 4 q q^T for q = (x, y, z, w), linear in R; its longest row is the quaternion to full accuracy.
+    # 4 q q^T for q = (x, y, z, w) is linear in R; its longest row gives q with full accuracy.
     outer = np.empty((len(r), 4, 4))
     outer[:, :3, :3] = r + r.swapaxes(1, 2)
     outer[:, 3, :3] = outer[:, :3, 3] = (r - r.swapaxes(1, 2))[:, (2, 0, 1), (1, 2, 0)]

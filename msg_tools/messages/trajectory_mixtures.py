@@ -32,23 +32,24 @@ TRAJECTORY_MIXTURE = 'hmt_msgs/msg/TrajectoryMixture'
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryMixture:
-    """The content of the message: M trajectories of T poses with d degrees of freedom.
+    """Content of a TrajectoryMixture message: M trajectories of T poses.
 
     Attributes:
         weights: (M,) weights that sum to 1.
         means: (M, T, d) poses, m and rad.
-        marginal_covariances: (M, T, d, d) including the inflation; None if not computed.
+        marginal_covariances: (M, T, d, d) covariances of single poses, including the inflation;
+            None if not computed.
         log_joint: (M,) log p(trajectory, images) at the mean.
         inflation: (M,) factor on the standard deviations.
         stamps_ns: (T,) times of the poses, increasing.
-        final_until_ns: poses at or before this time will not be revised.
+        final_until_ns: time up to which poses are final.
         free_energy: (I,) free energy per iteration, nats.
         body_model: name of the body.
         dof_names: (d,) order of the variables.
         frame_id: optical frame of the camera.
         segment_lengths: segment lengths by name, m, see `PoseMixture`; empty if unknown.
         joint_names: (J,) order of the joints.
-        joint_positions: (M, T, J, 3) m, at the means; None if not computed.
+        joint_positions: (M, T, J, 3) joint positions at the means, m; None if not computed.
         identities: (M,) identities of the motions, constant within a track, from 1; 0 for no
             identity, None if no component has one.
 
@@ -122,7 +123,7 @@ def trajectory_mixture_message(messages: MessageFactory, content: TrajectoryMixt
         dof_names=list(content.dof_names),
         joint_names=list(content.joint_names),
         stamps=[time_message(messages, stamp) for stamp in content.stamps_ns],
-        # A message can have no earlier stamp.
+        # A message can not contain an earlier time.
         final_until=time_message(messages, max(content.final_until_ns, EARLIEST_NS)),
         free_energy=content.free_energy,
         components=components,
@@ -134,13 +135,13 @@ def trajectory_mixture_message(messages: MessageFactory, content: TrajectoryMixt
 def trajectory_mixture_of(
     message: Any, dof_names: Sequence[str] | None = None
 ) -> TrajectoryMixture:
-    """The content of an hmt_msgs/TrajectoryMixture, of `rosbags` or of ROS.
+    """Reads an hmt_msgs/TrajectoryMixture message of `rosbags` or of ROS.
 
     Args:
-        dof_names: required names in this order; None accepts any.
+        dof_names: required names in this order; None accepts any names.
 
     Raises:
-        MessageError: other names, contradictory lengths of arrays, weights that are no
+        MessageError: other names, contradictory lengths of arrays, weights that are not
             probabilities, covariances that are not positive definite, or stamps that do not
             increase.
     """

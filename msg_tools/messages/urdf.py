@@ -28,7 +28,7 @@ from hmt_ros.core import elementary
 from hmt_ros.inference.linear_algebra import product
 from msg_tools.messages.message_error import Array, MessageError
 
-# Limit in place of none, because URDF requires one for such joints, m or rad.
+# Limit of unlimited joints, m or rad, because URDF requires a limit.
 _UNLIMITED = 1000.0
 _AXES = ('1 0 0', '0 1 0', '0 0 1')
 
@@ -134,7 +134,7 @@ def link_frames(
     for segment, name in enumerate(skeleton.segment_names):
         own = skeleton.segment_dofs[segment]
         chain = [(name, turned[segment], origins[segment])]
-        # From the segment to its parent; links of translations have the rotation of the parent.
+        # Go from the segment to its parent; links of translations have the parent's rotation.
         rotation, place = turned[segment], origins[segment]
         parent = skeleton.parents[segment]
         unturned = np.eye(3) if parent == -1 else turned[parent]
@@ -166,7 +166,7 @@ def add_limit(joint: ET.Element, lower: float, upper: float) -> None:
 
 
 def add_rod(link: ET.Element, end: Array, radius: float) -> None:
-    """Adds a rod to a link, from its origin to an end (3,), m, unless both are one point."""
+    """Adds a rod to a link, from its origin to an end (3,), m; no rod if both are equal."""
     length = float(np.linalg.norm(end, axis=0))
     if length < 1e-6:
         return

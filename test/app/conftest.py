@@ -1,4 +1,4 @@
-"""A bag of made-up mixtures, the bag of its images, and the report of both."""
+"""A bag of synthetic mixtures, the bag of its images, and the report of both."""
 
 import json
 import re
@@ -28,7 +28,7 @@ CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 
 @dataclass(frozen=True)
 class Made:
-    """A bag of made-up mixtures, the bag of its images, and the truth."""
+    """A bag of synthetic mixtures, the bag of its images, and the truth."""
 
     out: Path
     images: Path
@@ -42,7 +42,7 @@ def body():
 
 @pytest.fixture(scope='session')
 def poses(body):
-    """True poses (T, d): an arm that is raised."""
+    """True poses (T, d) of a person who raises an arm."""
     poses = np.tile(np.clip(np.zeros(body.dimension), body.lower, body.upper), (FRAMES, 1))
     poses[:, 2] = 4.0
     bends = [i for i, name in enumerate(body.dof_names) if 'left_shoulder' in name]
@@ -148,7 +148,7 @@ def make(out, folder, *options):
 
 @pytest.fixture
 def no_pictures(monkeypatch):
-    """Reports are pages alone, for tests of what no picture shows otherwise than others do."""
+    """Reports without pictures, for tests that do not need them."""
     monkeypatch.setattr(report, 'draw_pictures', lambda *_: [])
 
 

@@ -55,7 +55,7 @@ def test_commands_explain_themselves(command, capsys):
 
 
 def output_of_reader_that_leaves(lines, *command):
-    """The first lines of a program that nobody reads further, exit code and stderr."""
+    """First lines of a program whose reader then leaves, its exit code and stderr."""
     with subprocess.Popen(
         [sys.executable, *command],
         cwd=ROOT,
@@ -91,5 +91,5 @@ def test_commands_end_quietly_when_nobody_reads_on():
     [('hmt_ros', '--help'), ('tools.demonstration.demo', '--help'), ('benchmarks', '--help')],
 )
 def test_help_ends_quietly_when_nobody_reads_it(command):
-    """What is printed waits in a buffer until the command ends."""
+    """The output waits in a buffer until the command ends."""
     assert output_of_reader_that_leaves(0, '-m', *command) == ([], 141, '')

@@ -1,4 +1,4 @@
-"""The command evaluate, on small bags of made-up mixtures whose truth is known."""
+"""The command evaluate, on small bags of synthetic mixtures with known truth."""
 
 import json
 import math
@@ -91,7 +91,7 @@ def bag(tmp_path_factory, body, poses, mixtures):
 
 
 def run(capsys, *arguments):
-    """Runs the command and gives its exit code, its output and its lines on stderr."""
+    """Runs the command; returns its exit code, its output and its lines on stderr."""
     code = main([str(x) for x in arguments])
     captured = capsys.readouterr()
     return code, captured.out, captured.err.splitlines()
@@ -109,7 +109,7 @@ def relative(body, joints):
 
 
 def without_names(summary):
-    """Numbers, but those of absolute positions, which the library is not asked for here."""
+    """Numbers of a summary, without those of absolute positions, which are not tested here."""
     numbers = {key: value for key, value in summary.items() if not isinstance(value, (str, dict))}
     return {key: value for key, value in numbers.items() if not key.startswith('absolute')}
 
@@ -154,7 +154,7 @@ def test_table_for_people(capsys, bag, truth_file):
 
 
 def test_a_bag_without_body(capsys, tmp_path, body, mixtures, bag, truth_file):
-    """Mixtures carry the lengths of a known model; of another there are only errors."""
+    """Mixtures contain the lengths of a known model; for other models only errors are scored."""
 
     def of_a_stranger(message):
         message.body_model = 'stranger'
@@ -178,7 +178,7 @@ def test_a_bag_without_body(capsys, tmp_path, body, mixtures, bag, truth_file):
 
 @pytest.mark.parametrize('torn', [False, True])
 def test_mixtures_carry_the_lengths(capsys, tmp_path, body, mixtures, truth_file, torn):
-    """The bag's body is of another person; joints that lie elsewhere are noticed."""
+    """The bag's body is of another person; joints in other places are detected."""
     path = tmp_path / 'out'
     with BagWriter(path) as bag:
         other = body.with_stature(1.6)
@@ -247,7 +247,7 @@ def test_every_topic_gets_a_row_and_one_can_be_chosen(
     assert without_names(likelihood) == without_names(smoothed)
     one = report(capsys, path, '--truth', truth_file, '--topic', '/p/smoothed_pose_mixture')
     assert list(one['topics']) == ['/p/smoothed_pose_mixture']
-    # A relative name does, where one namespace has it.
+    # A relative name is enough if one namespace has it.
     assert one == report(capsys, path, '--truth', truth_file, '--topic', 'smoothed_pose_mixture')
     code, out, _ = run(capsys, path, '--truth', truth_file)
     assert code == 0
@@ -256,7 +256,7 @@ def test_every_topic_gets_a_row_and_one_can_be_chosen(
 
 @pytest.mark.parametrize('with_covariances', [True, False])
 def test_marginals_of_trajectories(capsys, tmp_path, body, mixtures, truth_file, with_covariances):
-    """Windows overlap; of a frame the newest one counts."""
+    """Windows overlap; the newest one is used for each frame."""
     path = tmp_path / 'out'
 
     def window(first, last, shift):
@@ -399,7 +399,7 @@ def test_feet_against_the_floor(tmp_path, body, mixtures, truth_file, capsys):
     with np.load(truth_file) as known:
         content = dict(known)
     content['gravity'] = np.tile([0.0, 1.0, 0.0], (FRAMES, 1))
-    # A floor that is higher than every foot.
+    # A floor above every foot.
     feet = [i for i, name in enumerate(body.joint_names) if name.endswith(('ankle', 'toe'))]
     content['camera_height'] = np.full(FRAMES, content['joints'][:, feet, 1].min() - 0.5)
     content['contact'] = np.ones((FRAMES, 2))

@@ -30,7 +30,7 @@ UP, HEIGHT = np.array([0.0, -0.8, -0.6]), 1.5
 
 @dataclass(frozen=True)
 class Step:
-    """What is known of a time: modes of some weights and identities; none: nobody is seen."""
+    """Weights and identities of the modes at a time; empty if nobody is visible."""
 
     stamp: int
     weights: tuple[float, ...] = (0.7, 0.3)
@@ -43,7 +43,7 @@ STEPS = tuple(Step(stamp) for stamp in STAMPS)
 
 
 def write_run(path, body, poses, steps, *, kind=MixtureKind.SMOOTHED, change=None, grounds=()):
-    """A bag of one topic; of two modes the second is the first with its left elbow bent."""
+    """Writes a bag of one topic; a second mode is the first with its left elbow bent."""
     elbow = body.dof_names.index('left_elbow')
     topic = kind.name.lower()
     with BagWriter(path) as bag:
@@ -71,7 +71,7 @@ def run(body, poses, tmp_path_factory):
 
 
 def exported(bag, out, *options):
-    """The file that the command writes."""
+    """Runs the command and returns its file."""
     assert export.main([str(bag), '-o', str(out), '--quiet', *map(str, options)]) == 0
     return out
 
@@ -82,7 +82,7 @@ def arrays(bag, out, *options):
 
 
 def bvh_joints(bag, out, body, *options):
-    """Joints (T, J, 3) of a written BVH, y up, and its frames a second."""
+    """Joints (T, J, 3) of a written BVH, y up, and its frames per second."""
     path = exported(bag, out.with_suffix('.bvh'), *options)
     motion = read_motion(path, unit_to_m=1.0, up_axis='y')
     joints = motion.joint_positions(body.joint_names)
@@ -90,7 +90,7 @@ def bvh_joints(bag, out, body, *options):
 
 
 def room(joints):
-    """Joints in the axes of the camera, with y up."""
+    """Joints in axes like the camera's, with y up."""
     return joints * [1.0, -1.0, -1.0]
 
 
@@ -148,7 +148,7 @@ def test_a_table_has_positions_and_the_radii_of_their_regions(run, body, tmp_pat
     drawn = np.random.default_rng(0).multivariate_normal(
         np.zeros(3), first.joint_covariances[0, wrist], 20_000
     )
-    # The sphere surrounds the region: it holds a little more.
+    # The sphere encloses the region and contains a little more.
     assert 0.9 <= (np.linalg.norm(drawn, axis=1) < radius).mean() < 0.97
 
 
@@ -173,8 +173,8 @@ def test_one_motion_is_followed_through_its_gaps(body, poses, tmp_path, capsys):
     out = capsys.readouterr().out
     assert 'two.bvh: 5 poses over 0.60 s at 10 a second, of /smoothed\n' in out
     assert 'motion 2 of track 1' in out
-    assert 'gaps: 1, the longest of 0.30 s' in out
-    # The gap is interpolated: there are as many frames as if there were none.
+    assert 'gaps: 1, the longest 0.30 s' in out
+    # The gap is interpolated, so the number of frames is that without a gap.
     assert 'Frames: 7\n' in (tmp_path / 'two.bvh').read_text()
     assert export.main([str(bag), '-o', str(tmp_path / 'all.npz')]) == 0
     assert (
@@ -202,7 +202,7 @@ def test_skeletons_stand_on_the_floor(body, poses, tmp_path, capsys):
     joints = arrays(bag, tmp_path / 'a')['joints']
     found, _ = bvh_joints(bag, tmp_path / 'a', body)
     np.testing.assert_allclose(found[..., 1], joints @ UP + HEIGHT, atol=1e-4)
-    # Straight ahead of the camera is against z, to the right of the image x.
+    # Away from the camera is -z; to the right of the image is x.
     np.testing.assert_allclose(found[..., 0], joints[..., 0], atol=1e-4)
     assert (found[..., 2] < 0).all()
     camera, _ = bvh_joints(bag, tmp_path / 'b', body, '--camera-axes')
@@ -236,7 +236,7 @@ def test_a_body_that_is_not_known_leaves_tables(body, poses, tmp_path, capsys):
     )  # fmt: skip
     exported(bag, tmp_path / 'a.csv')
     assert export.main([str(bag), '-o', str(tmp_path / 'a.bvh')]) == 1
-    assert "the body 'giant' is not known: --body names its model" in capsys.readouterr().err
+    assert "the body 'giant' is not known: name its model with --body" in capsys.readouterr().err
     exported(bag, tmp_path / 'a.bvh', '--body', 'human37')
 
 
@@ -250,7 +250,7 @@ def test_a_body_that_is_not_known_leaves_tables(body, poses, tmp_path, capsys):
         ('a.bvh', ['--identity', '9'], 'has no motion of identity 9; the longest are 1, 2'),
         ('a.bvh', ['--track', '7'], 'has no track 7; it has [1]'),
         ('a.bvh', ['--identity', 'x'], 'wanted a whole number from 1 to 9223372036854775807'),
-        ('no/a.bvh', [], 'no/a.bvh can not be written: its folder is no place to write to'),
+        ('no/a.bvh', [], 'no/a.bvh can not be written: its folder is missing or not writable'),
         ('folder.bvh', ['--overwrite'], 'folder.bvh is not replaced: it is a link or no file'),
         ('link.bvh', [], 'link.bvh exists; give another name, or --overwrite'),
         ('link.bvh', ['--overwrite'], 'link.bvh is not replaced: it is a link or no file'),

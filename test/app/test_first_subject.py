@@ -1,4 +1,4 @@
-"""The start of a track from keypoints, as a subject file."""
+"""Subject files made from keypoints, as the start of a track."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def write_bag(path, found):
 
 
 def started(bag, body):
-    """The subject file of a bag as it is read."""
+    """The subject file made for a bag, as read again."""
     file = bag.parent / 'subject.yaml'
     file.write_text(subject_text(find_start(bag, body), 1.8), 'utf-8')
     return read_subject(file, body)
@@ -63,7 +63,7 @@ def test_first_image_that_shows_enough(tmp_path, human37):
     assert read.stamp_ns == START_NS + 2 * STEP
     assert read.stature == 1.8
     names = schemes()['coco17'].names
-    # Eyes, ears and nose are at no joint; the wrist is not seen well.
+    # Eyes, ears and nose belong to no joint; the wrist is not seen well.
     assert {*read.keypoints.names} == {*names[5:]} - {'left_wrist'}
     knee = read.keypoints.names.index('right_knee')
     i = names.index('right_knee')

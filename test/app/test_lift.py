@@ -1,4 +1,4 @@
-"""`lift`: from files of detectors to a bag of mixtures and a report."""
+"""`lift`: from detector files to a bag of mixtures and a report."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SCHEME = schemes()['coco17']
 
 
 def seen(count=6):
-    """Keypoints (T, 17, 2) and confidences (T, 17) of somebody who walks, without eyes and ears."""
+    """Keypoints (T, 17, 2) and confidences (T, 17) of a walking person, without eyes and ears."""
     poses = procedural_sequence('walk', BODY, 1.0, 0).poses[:count].copy()
     poses[:, :3] += np.array([0.0, 0.0, 4.0]) - poses[0, :3]
     pixels = CAMERA.project(BODY.joint_positions(poses).reshape(-1, 3)).reshape(count, -1, 2)
@@ -72,7 +72,7 @@ def test_arrays_become_mixtures_and_a_report(tmp_path):
 
 
 def upside_down(path):
-    """The keypoints of a camera that hangs, whose centre is that of the image."""
+    """The keypoints of an upside-down camera with a centred principal point."""
     pixels, sure = seen(12)
     pixels[sure > 0] = 2.0 * np.array([CAMERA.cx, CAMERA.cy]) - pixels[sure > 0]
     np.savez(path, landmark_names=np.array(SCHEME.names), pixels=pixels, visibility=sure)
@@ -90,10 +90,10 @@ def test_a_camera_that_hangs_upside_down(tmp_path, capsys):
         assert lift.main(arguments) == 0
         joints.append(np.array([one.joint_positions[0] for one in mixtures(out)]))
     assert joints[1] * [-1, -1, 1] == pytest.approx(joints[0], abs=5e-3)
-    # The reading of an accelerometer is told, and used the other way round.
+    # An accelerometer reading is detected, and inverted.
     assert joints[2] == pytest.approx(joints[0])
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith('lift: the gravity that is given points to the head of the person')
+    assert line.startswith('lift: the given gravity points to the head of the person')
     assert line.endswith('the opposite is used, [0.00, 1.00, 0.00]')
 
 

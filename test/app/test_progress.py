@@ -1,4 +1,4 @@
-"""Progress of commands: a bar on a terminal, lines elsewhere, stdout left to results."""
+"""Progress of commands: a bar on a terminal, lines elsewhere; stdout has only results."""
 
 import os
 import select
@@ -18,7 +18,7 @@ def often(monkeypatch):
 
 
 def wait_for(capsys, text):
-    """What is printed on stderr until a text is."""
+    """What is printed on stderr until a text appears."""
     printed, end = '', time.monotonic() + 20
     while text not in printed:
         assert time.monotonic() < end, printed
@@ -66,7 +66,7 @@ def test_bar_on_a_terminal_that_has_room(monkeypatch, columns):
 
 
 def test_commands_without_a_terminal(tmp_path, capsys, monkeypatch):
-    """Lines on stderr, results on stdout."""
+    """Progress goes to stderr in lines, results go to stdout."""
     monkeypatch.setattr(progress, 'INTERVAL', 1e-3)
     small = ['--duration', '0.5', '--size', '160x120']
     assert make_bag.main(['reach', '-o', str(tmp_path / 'reach'), *small]) == 0

@@ -1,4 +1,4 @@
-"""track-video: a video in, bags and a report out."""
+"""track-video: from a video to bags and a report."""
 
 from dataclasses import replace
 from functools import partial
@@ -21,7 +21,7 @@ from test.test_docs import ROOT, commands
 
 @pytest.fixture(autouse=True)
 def installed(monkeypatch):
-    """Names of detectors that are installed; none, wherever tests run, unless one says so."""
+    """Names of installed detectors; empty in all tests that do not fill it."""
     names: list[str] = []
     for name, kind in DETECTORS.items():
         answer = partial(names.__contains__, name)
@@ -31,7 +31,7 @@ def installed(monkeypatch):
 
 @pytest.fixture
 def begun(monkeypatch):
-    """Options of imports, settings of replays and notes of reports, none of which are made."""
+    """Recorded options of imports, settings of replays and notes of reports, which do not run."""
     seen = SimpleNamespace(imports=[], settings=[], notes=[])
     monkeypatch.setattr(
         track_video, 'import_video', lambda options, tell: seen.imports.append(options)
@@ -59,7 +59,7 @@ def keypoints(folder):
 
 
 def test_from_video_to_report(walk_video, tmp_path, monkeypatch, capsys):
-    """By the command line of the README."""
+    """Runs the command line of the README."""
     out = tmp_path / 'walk'
     for name in ('walk.mp4', 'walk.json'):
         (tmp_path / name).symlink_to(walk_video / name)
@@ -78,7 +78,7 @@ def test_from_video_to_report(walk_video, tmp_path, monkeypatch, capsys):
     truth = read_truth(walk_video / 'rendered' / 'truth.npz')
     scored = score_bag(out / 'tracked', truth, topics=['pose_mixture'])['/pose_mixture']
     assert len(scored.scores) == 7
-    # Of the depth of limbs the first images know little; the right way round is below 0.2 m.
+    # The first images determine limb depths poorly; a correct facing is below 0.2 m.
     assert np.median(scored.scores.best) < 0.1
     assert run(walk_video, '-o', str(out), *keypoints(walk_video)) == 1
     (line,) = capsys.readouterr().err.splitlines()
@@ -139,7 +139,7 @@ def test_without_options_the_detector_and_the_usual_lens_are_used(
     (options,) = begun.imports
     assert options.output == Path('walk_tracked/video')
     assert (options.detector, options.fov, options.vertical_fov) == ('mediapipe', 60.0, None)
-    # Its error is in the results, its words on stderr and on the page.
+    # Its error is in the results, its explanation on stderr and on the page.
     assert begun.settings == [['focal_length_sigma=0.2']]
     (note,) = begun.notes[0]
     assert note.startswith('the field of view is assumed to be 60 degrees along the longer side')
@@ -164,7 +164,7 @@ def test_what_is_given_is_not_assumed(walk_video, begun, installed, tmp_path, ca
     assert [options.detector for options in begun.imports] == [None, None]
     assert begun.settings == [[], []]
     assert capsys.readouterr().err == ''
-    # What a user sets comes last.
+    # Settings of the user come last.
     given = ['--set', 'focal_length_sigma=0.05']
     assert track_video.main([str(walk_video / 'walk.mp4'), '--quiet', *out, *given]) == 0
     assert begun.settings[-1] == ['focal_length_sigma=0.2', 'focal_length_sigma=0.05']
@@ -195,8 +195,8 @@ def test_metadata_tell_the_lens(walk_video, begun, tmp_path, monkeypatch, capsys
         (['--subject', 'nothing.yaml'], 'nothing.yaml: no such file'),
         (['--subject', 'a.yaml', '--stature', '1.7'], '--stature: not allowed with argument'),
         (['--keypoints', 'nothing.json'], 'nothing.json: no such file'),
-        (['--people', '2', '--stature', '1.7'], '--stature is of one person'),
-        (['--people', '2', '--subject', 'a.yaml'], '--subject is of one person'),
+        (['--people', '2', '--stature', '1.7'], '--stature is for one person'),
+        (['--people', '2', '--subject', 'a.yaml'], '--subject is for one person'),
         (['--camera', 'camera.yaml'], '--camera: not allowed with argument --fov'),
     ],
 )

@@ -1,4 +1,4 @@
-"""The bodies that ship: names, symmetry, lengths, stature."""
+"""The bundled bodies: names, symmetry, lengths, stature."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def body(request):
 
 
 def standing(body) -> np.ndarray:
-    """Upright before the camera, every joint at rest."""
+    """An upright pose in front of the camera, every joint at rest."""
     pose = np.zeros((1, body.dimension))
     pose[0, body.skeleton.dof_index(('root_tz',))] = 4.0
     return pose

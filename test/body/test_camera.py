@@ -1,4 +1,4 @@
-"""The camera against OpenCV and finite differences."""
+"""The camera, compared with OpenCV and finite differences."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_magnification_is_pixels_for_a_metre(depth):
     a, b = camera.project([[0.0, 0.1, depth], [0.01, 0.1, depth]])
     assert camera.magnification(depth) == pytest.approx((b - a)[0] / 0.01)
     wide = Camera(600.0, 150.0, 320.0, 240.0, 640, 480)
-    # The area of a square metre is right where the pixels are not square.
+    # The area of a square metre is correct for non-square pixels.
     assert wide.magnification(depth) ** 2 == pytest.approx(600.0 * 150.0 / depth**2)
 
 
@@ -161,14 +161,14 @@ def test_scaled_camera_sees_the_same_through_larger_pixels():
     points = points_in_view(50, 5)
     np.testing.assert_allclose(2 * (half.project(points) + 0.5), camera.project(points) + 0.5)
     assert camera.scaled(640, 480) == camera
-    # Sizes are whole pixels: 853.3 x 480.
+    # Sizes are rounded to whole pixels: 853.3 x 480.
     assert Camera(900, 900, 640, 360, 1280, 720).scaled(853, 480).width == 853
     with pytest.raises(ValueError, match='640x480 pixels, which have another shape than 640x360'):
         camera.scaled(640, 360)
 
 
 def test_distances_that_people_and_cameras_have():
-    """Log-normal with 95 % between the limits, which a longer lens moves away; never a limit."""
+    """A log-normal prior with 95 % between limits that scale with the focal length."""
     focal = 320.0 / np.tan(0.5 * USUAL_LENS)
     usual = Camera(focal, focal, 319.5, 239.5, 640, 480)
     far = replace(usual, fx=3.0 * focal, fy=3.0 * focal)

@@ -1,4 +1,4 @@
-"""Superquadric flesh: surface, normals, contours and mesh against their definitions."""
+"""Superquadric flesh: surface, normals, contours and mesh, compared with definitions."""
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ def implicit(part, points):
 
 
 def looks(n, seed):
-    """Rotations (n, 3, 3) and places (n, 3) of a segment before the camera."""
+    """Rotations (n, 3, 3) and positions (n, 3) of a segment in front of the camera."""
     rng = np.random.default_rng(seed)
     q, r = np.linalg.qr(rng.normal(size=(n, 3, 3)))
     q = q * np.sign(np.diagonal(r, axis1=1, axis2=2))[:, None, :]

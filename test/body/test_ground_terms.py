@@ -40,7 +40,7 @@ def body():
 
 @pytest.fixture(scope='module')
 def poses(body):
-    """(12, d) some that lean, stand badly, and have feet below the floor."""
+    """Poses (12, d), some that lean, are off balance, or have feet below the floor."""
     rng = np.random.default_rng(0)
     sigma = np.where(np.isfinite(body.prior_sigma), body.prior_sigma, 0.0)
     x = body.prior_mean + sigma * rng.normal(size=(12, body.dimension))
@@ -51,14 +51,14 @@ def poses(body):
 
 @pytest.fixture(scope='module')
 def standing(body):
-    """(1, d) upright, both feet on the floor below a level camera."""
+    """An upright pose (1, d), both feet on the floor below a level camera."""
     pose = np.zeros((1, body.dimension))
     pose[0, 2] = 3.0
     return pose
 
 
 def level_plane(body, pose):
-    """The floor under the soles of a pose (1, d), before a level camera."""
+    """The floor under the soles of a pose (1, d), for a level camera."""
     feet = soles(body)
     points = forward(body.skeleton, pose).points(feet.segments, feet.local)[..., 0]
     return FloorPlane(LEVEL, 0.0, float(-(points @ LEVEL).min()), 0.0)
@@ -118,7 +118,7 @@ def test_the_usual_lean_costs_nothing_and_heavy_tails_let_people_bend(name):
     bends = bool(skeleton.segment_dofs[trunk])
 
     def leaning(pelvis, spine):
-        """Cost and lean of the trunk (N,), of leans of the pelvis and angles of the spine."""
+        """Cost and lean of the trunk (N,), from leans of the pelvis and angles of the spine."""
         poses = np.zeros((len(pelvis), body.dimension))
         poses[:, 2] = 3.0
         poses[:, skeleton.dof_index(('root_x',))[0]] = pelvis
@@ -130,7 +130,7 @@ def test_the_usual_lean_costs_nothing_and_heavy_tails_let_people_bend(name):
         cost = energy_of(term, body, poses).value
         return cost, np.arctan2(-axis[2], -axis[1])
 
-    # Two degrees apart over all leans, then ever closer around the best.
+    # A grid of two degrees over all leans, then finer ones around the best.
     centre, width = np.radians([-30.0, -30.0 if bends else 0.0]), np.radians(60.0)
     for _ in range(3):
         offsets = np.linspace(-width, width, 61)
@@ -149,7 +149,7 @@ def test_the_usual_lean_costs_nothing_and_heavy_tails_let_people_bend(name):
 
 @pytest.mark.parametrize('angle', [-1.2, 0.9])
 def test_a_hidden_shank_is_upright_and_another_leans_as_it_likes(body, angle):
-    """Against a leg that is shown; the gradient is that of differences."""
+    """Compared with a visible leg; the gradient equals differences."""
     hip = body.skeleton.dof_index(('left_hip_x',))[0]
     shank = body.skeleton.chains['left_leg'][1]
     poses = np.zeros((2, body.dimension))

@@ -1,4 +1,4 @@
-"""What the joints of a body err by in every pose."""
+"""Errors of the joints of a body that are the same in every pose."""
 
 import numpy as np
 import pytest

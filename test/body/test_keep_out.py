@@ -1,4 +1,4 @@
-"""Capsules that hold a person over all modes."""
+"""Capsules that enclose a person over all modes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BODY = load_body('human37')
 
 
 def posterior(depth=0.0, weights=(0.6, 0.395, 0.005)):
-    """Modes 0.5 m apart to the side; the deviation of the depth is given."""
+    """Modes 0.5 m apart sideways, with a given standard deviation of depth."""
     means = np.zeros((len(weights), BODY.dimension))
     means[:, 2] = 3.0
     means[:, 0] = 0.5 * np.arange(len(weights))
@@ -40,7 +40,7 @@ def test_every_joint_of_every_mode_that_counts_is_inside():
     inside = keep_out_capsules(BODY, mixture)
     assert inside.contain(joints[0]).all()
     assert inside.contain(joints[1]).all()
-    # The third is less probable than what may be outside.
+    # The third mode is less probable than the probability left outside.
     assert not inside.contain(joints[2]).all()
     assert keep_out_capsules(BODY, mixture, 0.9999).contain(joints[2]).all()
 
@@ -56,7 +56,7 @@ def test_the_flesh_is_inside():
 
 @pytest.mark.parametrize('probability', [0.5, 0.9, 0.99])
 def test_drawn_joints_are_inside_as_often_as_asked_for(probability):
-    """Each joint at least; depth varies by a metre and a half."""
+    """At least as often for each joint; depth varies by 1.5 m."""
     mixture = posterior(depth=0.5, weights=(0.7, 0.3))
     drawn = mixture.sample(300, np.random.default_rng(0))
     joints = BODY.joint_positions(drawn)

@@ -1,4 +1,4 @@
-"""Forward kinematics and Jacobians against Pinocchio, finite differences and dense algebra."""
+"""Kinematics and Jacobians compared with Pinocchio, finite differences and dense algebra."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from test.oracles.numpy_kinematics import assemble, segment_sums
 BODIES = {name: load_body(name) for name in ('human37', 'human34', 'human32')}
 STEP = 1e-6
 
-# Another order of angles, an inner joint that slides, and a root whose translations stand last.
+# Another order of angles, a sliding inner joint, and a root with its translations last.
 SLIDING = """HIERARCHY
 ROOT base
 {
@@ -68,7 +68,7 @@ def body(request) -> Body:
 
 
 def pinocchio_model(body: Body):
-    """The skeleton as a Pinocchio model, and for each segment its joint and place in it."""
+    """The skeleton as a Pinocchio model, and joint and placement of each segment."""
     pin = pytest.importorskip('pinocchio')
     kinds = {
         (0, True): pin.JointModelRX, (1, True): pin.JointModelRY, (2, True): pin.JointModelRZ,

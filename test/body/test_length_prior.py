@@ -12,7 +12,7 @@ LENGTHS, PROPORTIONS = np.array([0.42, 0.41, 0.02]), np.array([0.04, 0.05, 0.8])
 
 
 def test_lengths_share_a_stature():
-    """Against samples of the log-normal model of a stature and of proportions."""
+    """Against samples of the log-normal model of stature and proportions."""
     rng = np.random.default_rng(0)
     stature, own = 0.05 * rng.normal(size=(400_000, 1)), rng.normal(size=(400_000, 3))
     people = LENGTHS[:2] * np.exp(stature + PROPORTIONS[:2] * own[:, :2])
@@ -22,7 +22,7 @@ def test_lengths_share_a_stature():
 
 
 def test_what_is_measured_holds_lengths():
-    """Against people drawn from the prior, weighted by how well they agree with a measurement."""
+    """Against people drawn from the prior and weighted by the likelihood of a measurement."""
     covariance = length_covariance(LENGTHS, PROPORTIONS, 0.05)
     rows, sigma = np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 0.0]]), np.array([0.02, 0.01])
     rng = np.random.default_rng(1)

@@ -1,4 +1,4 @@
-"""Root angles of a camera on its side: the level of a body, and poses at another one."""
+"""Root angles with a camera on its side: the level of a body, and poses at another level."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def rolled(degrees: float) -> np.ndarray:
 
 
 def facing(count: int = 8) -> np.ndarray:
-    """Poses (N, d) of people who stand and face all ways."""
+    """Poses (N, d) of standing people who face in all directions."""
     poses = np.tile(BODY.prior_mean, (count, 1))
     poses[:, :3] = [0.2, -0.3, 4.0]
     poses[:, 3] = np.linspace(0.1, 2.0 * np.pi, count)
@@ -50,7 +50,7 @@ def test_people_before_a_turned_camera_have_the_angles_of_an_upright_one(degrees
         BODY.skeleton.mounts
     )
     assert BODY.levelled(np.eye(3)) is BODY
-    # The prior of the limbs is that of the same body.
+    # The prior of the limbs is still found for the body.
     assert pose_prior(BODY.levelled(turn), LEARNED, 1.0) is not None
 
 
@@ -59,7 +59,7 @@ def test_poses_at_another_level_have_the_same_joints(degrees):
     level, poses = BODY.levelled(rolled(degrees)), facing()
     found = turned(level, poses, BODY)
     assert BODY.joint_positions(found) == pytest.approx(level.joint_positions(poses), abs=1e-9)
-    # Derivatives by differences.
+    # Derivatives against differences.
     jacobians, step = turn_jacobians(level, poses, BODY, found), 1e-6
     for j in range(3, 7):
         moved = poses.copy()

@@ -10,7 +10,7 @@ BODIES = ('human37', 'human34', 'human32')
 
 
 def drawn(body, count=20, seed=0):
-    """Poses within the limits, 3 to 5 m before the camera."""
+    """Poses within the limits, 3 to 5 m in front of the camera."""
     rng = np.random.default_rng(seed)
     low, high = np.maximum(body.lower, -np.pi), np.minimum(body.upper, np.pi)
     poses = rng.uniform(low, high, (count, body.dimension))
@@ -44,7 +44,7 @@ def test_depth_is_reversed_along_the_ray(name):
     body = load_body(name)
     poses = drawn(body)
     reversed_poses = reverse_depth(body, poses)
-    # Some would have to lean further than the root may.
+    # Some would have to lean further than the limits of the root.
     free = (np.abs(reversed_poses[:, 4:6]) < body.upper[4:6] - 1e-9).all(1)
     assert free.sum() > 10
     joints = body.joint_positions(poses)[free]

@@ -1,4 +1,4 @@
-"""Bodies from YAML files, and one clear line for files that are none."""
+"""Bodies from YAML files, and one clear error line for invalid files."""
 
 from __future__ import annotations
 

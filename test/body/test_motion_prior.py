@@ -1,4 +1,4 @@
-"""The motion prior of a body: the file that ships, damaged files, bodies without one."""
+"""The motion prior of a body: the packaged file, damaged files, bodies without a prior."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_bodies_without_a_file_walk_randomly(human32, human37):
     walk = motion_prior(human32)
     assert walk.state_dimension == human32.dimension
     np.testing.assert_array_equal(np.diagonal(walk.diffusion), human32.rates)
-    # So does one that has the name of another body, but not its degrees of freedom.
+    # So does a body with the name of another one but different degrees of freedom.
     other = replace(human32, skeleton=replace(human32.skeleton, name='human37'))
     assert motion_prior(other).state_dimension == human32.dimension
     assert shipped_motion('../models/human37') is None

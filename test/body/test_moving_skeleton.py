@@ -1,4 +1,4 @@
-"""Skeletons as BVH: another reader finds the joints where the body has them."""
+"""Skeletons in BVH files: another reader finds the joints in the same places as the body."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def root_angles(name, low, high, count=60):
     ('name', 'low', 'high'), [('root_z', 0.0, 6.0 * np.pi), ('root_x', -2.9, 2.9)]
 )
 def test_angles_go_on_where_a_person_turns(name, low, high):
-    """Programs interpolate angle by angle: none leaps by half a turn or a whole one."""
+    """No angle jumps by a half or whole turn, because programs interpolate angle by angle."""
     angles = root_angles(name, low, high)
     steps = np.abs(np.diff(angles, axis=0))
     assert steps.max() < 1.01 * np.degrees((high - low) / 59)

@@ -78,7 +78,7 @@ def plain_log_density(mixture: AngleMixture, x: np.ndarray) -> np.ndarray:
 
 def test_values_are_those_of_the_density():
     mixture, x = made_mixture(), poses(30)
-    # The broad component is its own mirror image where its mean and covariance are.
+    # The broad component is symmetric if its mean and covariance are.
     prior = MixturePrior(HUMAN, mixture, 0.3)
     rest = np.setdiff1d(np.arange(37), mixture.indices)
     z = (x - HUMAN.prior_mean)[:, rest] / HUMAN.prior_sigma[rest]
@@ -119,7 +119,7 @@ def test_positive_hessian_weighs_precisions_and_lies_above_the_exact_one():
     scale = np.abs(positive).max()
     assert np.linalg.eigvalsh(positive).min() > -1e-12 * scale
     assert np.linalg.eigvalsh(positive - exact).min() > -1e-9 * scale
-    # The quadratic that touches the energy lies above it, near and far.
+    # The tangent quadratic lies above the energy everywhere.
     value, gradient, _ = energy(prior, x)
     step = 0.7 * np.random.default_rng(3).normal(size=x.shape)
     above = value + (gradient * step).sum(1)
@@ -139,7 +139,7 @@ def test_the_most_probable_pose_costs_nothing():
     assert energy(prior, poses(500, 9)).value.min() > 0.0
 
 
-# The prior that ships.
+# The bundled prior.
 
 
 def test_the_shipped_prior_is_its_own_mirror_image_and_small():
@@ -165,7 +165,7 @@ def test_which_bodies_have_a_learned_prior():
     assert isinstance(pose_prior(load_body('human34'), 'learned', 0.5), AnglePrior)
     tall = HUMAN.with_stature(1.9).with_segment_lengths({'forearm': 0.3})
     assert pose_prior(tall, 'learned', 1.0).mixture is shipped_prior(HUMAN)
-    # Another body under the name: its frames at rest differ.
+    # Another body with the same name, but other rest frames.
     mounts = HUMAN.skeleton.mounts.copy()
     mounts[5] = mounts[5][:, [1, 2, 0]]
     other = replace(HUMAN, skeleton=replace(HUMAN.skeleton, mounts=mounts))
@@ -219,7 +219,7 @@ def single(*shape, value=0.0):
         ({'means': single(4, 3)}, 'IndexError'),
         ({'means': single(4, 10, value=np.nan)}, 'not finite'),
         ({'factors': single(4, 55)}, 'not positive definite'),
-        # Every row is the first column alone: all angles are one.
+        # Every row has only the first column, so all angles are equal.
         ({'factors': single(4, 55) + FIRST}, 'not positive definite'),
         ({'factors': single(4, 55, value=np.inf)}, 'not finite'),
         ({'weights': single(4, value=0.5)}, 'weights must be positive and sum to 1'),

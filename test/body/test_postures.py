@@ -1,4 +1,4 @@
-"""Limbs that nothing shows spread as people hold them, and the others stay as they are."""
+"""Limbs without evidence spread over usual postures, and the others keep their poses."""
 
 import numpy as np
 import pytest
@@ -57,12 +57,12 @@ def test_legs_that_nothing_ever_showed_are_the_modes_or_those_of_the_table(body,
         np.array([np.diag(s**2) for s in postures.sigmas[:, legs]]),
     )  # fmt: skip
     assert own.covariance()[np.ix_(legs, legs)] == pytest.approx(whole.covariance())
-    # What is seen is as it was, and does not go with what is not.
+    # Visible limbs are unchanged and not correlated with the unseen ones.
     assert spread.means[:, ~legs] == pytest.approx(modes.means[rows][:, ~legs])
     assert (spread.covariances[:, ~legs][:, :, legs] == 0.0).all()
     assert np.bincount(rows, spread.weights) == pytest.approx([0.7, 0.3])
     assert (np.diff(spread.weights) <= 0.0).all()
-    # The mode itself stays as one of the components.
+    # The mode itself remains one of the components.
     for k in range(2):
         (mine,) = np.flatnonzero((rows == k) & (which == 0))
         assert spread.means[mine] == pytest.approx(modes.means[k])

@@ -13,7 +13,7 @@ from hmt_ros.body.reference_human import (
     fit_reference_human,
 )
 
-# Links of the model whose origins are joints of ours.
+# Links of the model whose origins are joints of the body.
 PAIRS = {'torso': 'neck', 'head': 'head'} | {
     f'{letter}_{joint}': f'{side}_{joint}'
     for letter, (side, _) in SIDES.items()
@@ -38,7 +38,7 @@ REFERENCE = (
     ('l_knee', 'l_hip', 'l_knee', (0, -1, 0)),
     ('l_ankle', 'l_knee', 'l_ankle', None),
 )
-# Axes of the right side that are not those of the left.
+# Axes of the right side that differ from those of the left.
 RIGHT = {
     'r_y_shoulder': (0, 0, 1),
     'r_p_shoulder': (-1, 0, 0),
@@ -91,7 +91,7 @@ def test_without_added_joints_it_is_the_reference(human37, random_poses):
         wanted[name] = (parent.replace('l_', 'r_', 1), child, axis)
     assert axes == wanted
     assert sorted(human.angles) == sorted(REFERENCE_JOINTS)
-    # Legs hang on the hips, which the reference has; limbs keep their directions.
+    # Legs start at the reference's hips; limbs keep their directions.
     found = errors(body, positions, additions=False)
     legs = [i for i, link in enumerate(PAIRS) if link[2:] in ('hip', 'knee', 'ankle')]
     assert found[:, legs].max() < 1e-4
@@ -115,7 +115,7 @@ def test_angles_of_known_poses(human37):
     human = fit_reference_human(body.joint_names, body.joint_positions(pose[None])[0])
     assert human.angles['l_elbow'] == pytest.approx(1.0)
     assert human.angles['r_knee'] == pytest.approx(-1.2)
-    # The reference counts leaning forward from upright on.
+    # The reference measures forward lean from upright.
     assert human.angles['waist'] == pytest.approx(0.4)
 
 

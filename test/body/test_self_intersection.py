@@ -1,4 +1,4 @@
-"""Overlap of body parts against plain geometry, closed forms and finite differences."""
+"""Overlap of body parts, compared with geometry, closed forms and finite differences."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def overlap(body, pose, i, j):
 
 
 def pairs_of(body):
-    """Parts that are no neighbours and are apart in the mean pose."""
+    """Pairs of parts that are not neighbours and do not touch in the mean pose."""
     parts = body.flesh.parts
     carried = {p.segment for p in parts}
 
@@ -122,7 +122,7 @@ def test_value_is_the_sum_over_pairs(body, random_poses):
 
 
 def test_gradient_and_hessian_are_those_of_the_overlaps(small, random_poses):
-    """With round parts only the distance changes: central differences, and squares of slopes."""
+    """With round parts only the distance changes; checked by differences and squared slopes."""
     body = with_round_parts(small)
     poses = folded(body, 40, 1, random_poses)
     value, gradient, hessian = energy_of(body, poses)
@@ -149,7 +149,7 @@ def test_gradient_and_hessian_are_those_of_the_overlaps(small, random_poses):
 
 
 def test_the_gradient_points_uphill(body, random_poses):
-    """Elliptic cross-sections turn a little too: a small step against it lessens the overlap."""
+    """Elliptic sections also turn a little; a small step downhill reduces the overlap."""
     poses = folded(body, 60, 2, random_poses)
     value, gradient, _ = energy_of(body, poses)
     some = value > 0.1

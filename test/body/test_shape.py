@@ -1,4 +1,4 @@
-"""The shape of a person as a vector: derivatives against central differences of whole bodies."""
+"""The shape of a person as a vector: derivatives compared with central differences."""
 
 from dataclasses import replace
 
@@ -62,7 +62,7 @@ def test_centres_and_radii_have_their_derivatives(name):
 
 
 def test_points_on_the_flesh_have_their_derivatives(space, body, random_poses):
-    """A point keeps its place in units of the radii around the centre of its part."""
+    """A point keeps its position in units of the radii around the centre of its part."""
     pose = random_poses(body, 1, 3)
     frames = forward(body.skeleton, pose)
     rng = np.random.default_rng(4)
@@ -108,7 +108,7 @@ def test_sums_over_residuals_are_those_of_each_pose(space, body, random_poses):
     rng = np.random.default_rng(8)
     segments = np.array([shape.segment for shape in body.shapes])
     rows = np.stack([residuals(segments, *rng.normal(size=(2, len(segments), 3))) for _ in poses])
-    rows[1, 0, 0] = 5  # what follows is not read
+    rows[1, 0, 0] = 5  # later entries are not read
     none = np.zeros((3, 1, 9))
     together = space.second_order(forward(body.skeleton, poses), rows, none)
     for n in range(3):
@@ -121,7 +121,7 @@ NO_RESIDUALS = np.zeros((1, 1, 9))
 
 
 def residuals(owners, points, directions):
-    """Rows of one pose for `ShapeSpace.second_order`."""
+    """Residual rows of one pose for `ShapeSpace.second_order`."""
     rng = np.random.default_rng(9)
     rows = np.column_stack([owners, points, directions, rng.normal(size=(len(points), 2))])
     rows[:, 8] = np.abs(rows[:, 8])
@@ -129,7 +129,7 @@ def residuals(owners, points, directions):
 
 
 def are_sums(found, by_shape, by_pose, pull, curvature):
-    """Whether they are those over the rows (M, P), (M, d) of each residual."""
+    """Whether the found sums are those over rows (M, P), (M, d) of each residual."""
     weighed = (curvature[:, None] * by_shape).T
     wanted = (pull @ by_shape, weighed @ by_shape, weighed @ by_pose)
     return all(np.allclose(x[0], y, atol=1e-7) for x, y in zip(found, wanted, strict=True))
@@ -147,7 +147,7 @@ def test_growth_of_a_part(human37):
     assert after.radii == pytest.approx((rx * np.exp(0.1), ry * np.exp(-0.2), rz + 0.02))
     moved = np.subtract(after.centre, before.centre)
     assert moved == pytest.approx(np.array([0.0, 0.004, 0.01]))
-    # The start (z up) moves by 0.03 and the end by 0.01, each outwards.
+    # The start (z up) moves outwards by 0.03 and the end by 0.01.
     tops = [x.centre[2] + x.radii[2] for x in (before, after)]
     bottoms = [x.centre[2] - x.radii[2] for x in (before, after)]
     assert tops[1] - tops[0] == pytest.approx(0.03)

@@ -1,4 +1,4 @@
-"""What a skeleton checks when it is made, and how its parts are found by name."""
+"""The checks when a skeleton is made, and how its parts are found by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Angles that go round."""
+"""Angles that pass whole turns."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def test_each_pose_goes_on_from_the_nearest():
     shifted = poses.copy()
     shifted[:, YAW] += TURN * np.array([3, -2, 0])
     np.testing.assert_allclose(without_turns(BODY, shifted, before), poses, atol=1e-12)
-    # Nothing else is touched.
+    # All else is unchanged.
     found = without_turns(BODY, shifted, before)
     others = np.delete(np.arange(BODY.dimension), YAW)
     np.testing.assert_array_equal(found[:, others], shifted[:, others])
 
 
 def test_a_turn_that_a_person_makes_is_none_to_take_out():
-    """Image by image a heading goes on over any number of turns."""
+    """From image to image, a heading continues over any number of turns."""
     pose, yaw = np.tile(BODY.prior_mean, (1, 1)), 0.0
     for step in range(1, 100):
         seen = pose.copy()

@@ -1,4 +1,4 @@
-"""Arguments of the compiled core that do not fit: errors say which, and nothing crashes."""
+"""Invalid arguments of the compiled core: errors name them, and nothing crashes."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ def assert_arguments_are_checked(
     free: str = '',
     unread: str = '',
 ) -> None:
-    """Spoils one array after the other, also those in tuples, in every way.
+    """Spoils each array in every way, also those in tuples, and asserts that it is refused.
 
     Args:
-        function: of the core.
-        named: good arguments by their names, in their order.
-        outputs: names of those that are written.
+        function: function of the core.
+        named: valid arguments by name, in order.
+        outputs: names of the arguments that are written.
         free: names of arrays that may have any number of rows.
-        unread: names of arrays of integers that may be any.
+        unread: names of integer arrays whose values are not checked.
     """
     good = tuple(named.values())
     outputs_of, free_of, unread_of = outputs.split(), free.split(), unread.split()
@@ -69,7 +69,7 @@ def assert_arguments_are_checked(
 def _arrays(
     values: tuple[Any, ...], names: list[str]
 ) -> Iterator[tuple[tuple[int, ...], str, np.ndarray]]:
-    """Where arrays are in nested tuples, and what errors call them."""
+    """Positions of the arrays in nested tuples, and their names in errors."""
     for i, (value, name) in enumerate(zip(values, names, strict=True)):
         if isinstance(value, np.ndarray):
             yield (i,), name, value
@@ -86,7 +86,7 @@ def _replaced(values: tuple[Any, ...], path: tuple[int, ...], other: Any) -> tup
 
 
 def _read_only(value: Any) -> Any:
-    """The same memory, also inside tuples, for reading only."""
+    """The same memory as read-only arrays, also inside tuples."""
     if isinstance(value, tuple):
         own = [_read_only(x) for x in value]
         return value._make(own) if hasattr(value, '_make') else tuple(own)

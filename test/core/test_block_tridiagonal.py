@@ -15,7 +15,7 @@ from hmt_ros.core import (
 
 
 def dense(columns):
-    """The symmetric matrix in the columns of a band."""
+    """The symmetric matrix from the columns of its band."""
     size = len(columns)
     matrix = np.zeros((size, size))
     for j, column in enumerate(columns):
@@ -93,7 +93,7 @@ def test_blocks_of_the_inverse_are_those_of_the_dense_matrix(times, n, width):
     rng = np.random.default_rng(n)
     columns = 0.3 * rng.normal(size=(times * n, width + 1))
     columns[:, 0] = width + 1.0
-    # Blocks are coupled to the next one alone.
+    # Blocks are only coupled to the next one.
     columns[np.add.outer(np.arange(times * n) % n, np.arange(width + 1)) >= 2 * n] = 0.0
     inverse = np.linalg.inv(dense(columns)).reshape(times, n, times, n)
     assert factorise_band(columns) == times * n

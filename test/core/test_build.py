@@ -1,4 +1,4 @@
-"""How setup.py compiles the core: with stand-ins for the compiler, in a copy with small files."""
+"""How setup.py compiles the core: with stub compilers, in a copy with small files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-# Answers as a preprocessor that finds all; compiles when all that is compiled has begun.
+# As a preprocessor it finds all headers; it compiles once all compilations have begun.
 COMPILER = r"""#!/bin/bash
 case " $* " in
 *" -E "*) echo found 0 found 1 found 2; exit ;;
@@ -97,7 +97,7 @@ def test_files_are_compiled_at_the_same_time_and_only_if_changed(sources):
 
 
 def test_the_installed_core_says_how_it_is_built(tmp_path):
-    """Where it is missing, in a copy of the package."""
+    """The message where the core is missing, in a copy of the package."""
     package = tmp_path / 'hmt_ros'
     for name in ('__init__.py', 'core/__init__.py'):
         (package / name).parent.mkdir(parents=True, exist_ok=True)

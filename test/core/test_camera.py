@@ -1,4 +1,4 @@
-"""Pixels and rays of the core: arguments; the values are compared in test/body/test_camera.py."""
+"""Pixels and rays: invalid arguments are refused; test/body/test_camera.py checks values."""
 
 from __future__ import annotations
 

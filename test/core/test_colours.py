@@ -1,4 +1,4 @@
-"""Colours of pixels, counts of them, and lengths of gradients, against those of numpy."""
+"""Colours of pixels, their histograms and the lengths of gradients, against numpy."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ def test_without_derivatives_only_the_density_is_written():
 def test_arguments_that_do_not_fit_are_named(name):
     array = mixture()[name]
     wrong = [array.astype(np.float32), np.repeat(array, 2, -1)[..., ::2], array[:0]]
-    # The samples and the means give the numbers that the others are compared with.
+    # Samples and means define the sizes that the others are compared with.
     for bad in wrong[:2] if name in ('samples', 'means') else wrong:
         with pytest.raises((ValueError, TypeError), match=f'^{name}: wanted'):
             evaluate(mixture(**{name: bad}))
@@ -131,7 +131,7 @@ def test_no_numbers_are_survived():
         for name in ('samples', 'log_weights', 'inflation', 'bands')
     }
     assert not np.isfinite(found['log_weights']).any()
-    # The density of the component itself is known without the others.
+    # The density of the component itself does not need the others.
     assert np.isfinite(found['samples']).all()
     assert np.array_equal(found['samples'], found['bands'])
     assert np.array_equal(found['samples'], found['inflation'])

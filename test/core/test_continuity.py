@@ -1,4 +1,4 @@
-"""Transitions, histories and ways to face, against their equations in numpy."""
+"""Transitions, histories and facings against their equations in numpy."""
 
 from __future__ import annotations
 

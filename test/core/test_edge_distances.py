@@ -1,4 +1,4 @@
-"""Distances from edges: those of the shortest ways on the grid, for every orientation."""
+"""Distances from edges: the shortest paths on the grid, for every orientation."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from hmt_ros.core import ORIENTATIONS, edge_distances
 from test.core.arguments import assert_arguments_are_checked
 
-# Lengths of steps to the side and across, px.
+# Lengths of straight and diagonal steps, px.
 BESIDE, ACROSS = 0.955, 1.3693
 
 

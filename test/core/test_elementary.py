@@ -1,4 +1,4 @@
-"""Elementary functions: right to the last place, as numpy's in everything else."""
+"""Elementary functions: accurate to the last place, otherwise like numpy's."""
 
 import warnings
 
@@ -14,7 +14,7 @@ LARGEST = np.finfo(np.float64).max
 
 
 def magnitudes(low, high):
-    """Numbers of both signs whose sizes are 2^low to 2^high."""
+    """Numbers of both signs with magnitudes from 2^low to 2^high."""
     return RNG.choice([-1.0, 1.0], COUNT) * 2.0 ** RNG.uniform(low, high, COUNT)
 
 
@@ -23,24 +23,24 @@ def between(low, high):
 
 
 def worst(function, reference, *arguments):
-    """The greatest error in units in the last place of the reference."""
+    """Maximum error in units in the last place of the reference."""
     with np.errstate(over='ignore'):
         found, result = 0.0, getattr(elementary, function)(*arguments)
-    with mpmath.workprec(2300):  # multiples of pi are taken off the largest numbers
+    with mpmath.workprec(2300):  # for the reduction of the largest numbers by multiples of pi
         for saw, *given in zip(result, *arguments):
             exact = reference(*(mpmath.mpf(float(x)) for x in given))
             if abs(exact) > LARGEST:
                 assert saw == (np.inf if exact > 0 else -np.inf)
                 continue
             unit = float(np.spacing(abs(float(exact))))
-            # The last place of the binade that holds it, not of the next one that it rounds to.
+            # The last place of the binade that contains it, not of the one that it rounds to.
             if abs(exact) < abs(float(exact)) and np.frexp(float(exact))[0] in (0.5, -0.5):
                 unit = max(unit / 2, 5e-324)
             found = max(found, float(abs(mpmath.mpf(float(saw)) - exact) / unit))
     return found
 
 
-# Greatest errors found on three million numbers of each range, units in the last place: 0.79.
+# Maximum error on three million numbers of each range, in units in the last place: 0.79.
 @pytest.mark.parametrize('name', ['sin', 'cos'])
 @pytest.mark.parametrize(
     'x',
@@ -115,7 +115,7 @@ def signs(x):
 
 
 def reporting(function, arguments):
-    """The result, and the first words of the warnings."""
+    """The result, and the first words of warnings."""
     with warnings.catch_warnings(record=True) as caught, np.errstate(all='warn', under='ignore'):
         warnings.simplefilter('always')
         result = function(*arguments)

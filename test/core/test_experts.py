@@ -1,4 +1,4 @@
-"""Inputs of experts from windows of keypoints, and bones of other lengths, as numpy has them."""
+"""Inputs of experts from windows of keypoints, and other bone lengths, against numpy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Flips and products of limbs: what does not fit is refused; values are those of test/flips."""
+"""Flips and products of limbs: invalid arguments are refused; for values see test/flips."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from test.core.arguments import assert_arguments_are_checked
 BODY = load_body('human37')
 SKELETON = BODY.skeleton
 D = BODY.dimension
-# Numbers of limbs that only their configurations need.
+# Entries of limbs that only configurations need.
 UNREAD = 'limbs.segments limbs.parents limbs.joint_segments'
 
 
@@ -69,7 +69,7 @@ def test_leaves_need_arguments_that_fit():
     for changed, text in (
         ({'parent': -1}, 'chain.parent: wanted'),
         ({'parent': len(SKELETON.parents)}, 'chain.parent: wanted'),
-        # A hinge at first, a link that does not turn, one of four degrees of freedom.
+        # A hinge as first joint, a link without rotation, one with four degrees of freedom.
         ({'first_dofs': np.array([0, 1, 4, 6])[: count + 1]}, 'chain.first_dofs: wanted links'),
         ({'first_dofs': np.zeros(count + 1, np.int64)}, 'chain.first_dofs: wanted links'),
         ({'first_dofs': 4 * np.minimum(np.arange(count + 1), 1)}, 'chain.first_dofs: wanted links'),
@@ -88,7 +88,7 @@ def test_flips_of_the_torso_need_arguments_that_fit():
         'result': np.zeros((most, D)),
         'parents': np.zeros(most, np.int64),
     }
-    # A trunk may turn about two axes, or about none.
+    # A trunk with two axes of rotation, or none.
     assert_arguments_are_checked(
         fill_torso_flips, named, 'result parents', free='torso.trunk', unread='parents'
     )

@@ -1,4 +1,4 @@
-"""Arguments spoilt at random give a result or an error that names one; see tools/fuzz_core.py."""
+"""Randomly spoilt arguments give a result or an error that names one; see tools/fuzz_core.py."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_no_arguments_crash_the_core():
-    """In a process of its own, with the same core, which records the other tests' calls first."""
+    """A separate process with the same core first records the calls of the other tests."""
     command = [sys.executable, str(ROOT / 'tools' / 'fuzz_core.py'), '3000', '0']
     done = subprocess.run(
         command,

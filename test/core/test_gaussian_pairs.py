@@ -1,4 +1,4 @@
-"""Pairs of Gaussians: what does not fit is refused; values are those of the tests of reduction."""
+"""Pairs of Gaussians: invalid arguments are refused; the tests of reduction check values."""
 
 from __future__ import annotations
 

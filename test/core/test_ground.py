@@ -1,4 +1,4 @@
-"""Gravity and floor: what does not fit is refused; values are those of the tests of the body."""
+"""Gravity and floor: invalid arguments are refused; the tests of `body` check values."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from test.core.arguments import assert_arguments_are_checked
 def test_the_ground_needs_arguments_that_fit():
     body = load_body('human32')
     d = body.dimension
-    # The camera is low: the feet are below the floor.
+    # The camera is low, so the feet are below the floor.
     plane = FloorPlane(np.array([0.0, -1.0, 0.0]), 0.01, 0.1, 0.02)
     frames = forward(body.skeleton, np.full((1, d), 0.1))
     (columns,), (origins,) = frames.by_pose()

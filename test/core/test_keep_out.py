@@ -1,4 +1,4 @@
-"""Capsules that larger ones hold, against depths of their points."""
+"""Capsules enclosed by larger ones, against depths of their points."""
 
 from __future__ import annotations
 

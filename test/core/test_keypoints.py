@@ -1,4 +1,4 @@
-"""Energies of keypoints: values against plain numpy; what does not fit is refused."""
+"""Energies of keypoints: values compared with numpy; invalid arguments are refused."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def places(segments, offsets, columns, origins):
 
 
 def errors_of(given, columns, origins):
-    """Whitened errors (P, 2, 2) of the keypoints, as they are called and exchanged."""
+    """Whitened errors (P, 2, 2) of the keypoints, as named and exchanged."""
     points = given.points
     at = places(points.segments, points.offsets, columns, origins)
     gaps = CAMERA.project(at) - points.pixels[:, None]

@@ -1,4 +1,4 @@
-"""Placing of skeletons: what does not fit is refused; values are those of the tests of the body."""
+"""Placing of skeletons: invalid arguments are refused; the tests of `body` check values."""
 
 from __future__ import annotations
 

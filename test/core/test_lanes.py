@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def in_order(x, y):
-    """The sum of products as the header has it."""
+    """The sum of products in the order that the header defines."""
     whole = len(x) - len(x) % 8
     s = [0.0] * 8
     for i in range(whole):
@@ -32,7 +32,7 @@ def test_sums_have_the_bits_of_their_order(count):
 
 
 def test_nothing_is_compiled_with_leave_to_reorder():
-    """Its last bits would depend on the compiler and the processor."""
+    """Otherwise the last bits would depend on the compiler and the processor."""
     files = [ROOT / 'setup.py', *(ROOT / 'hmt_ros').rglob('*.h'), *(ROOT / 'hmt_ros').rglob('*.py')]
     assert len(files) > 100
     words = ('fast' + 'math', 'fast-' + 'math', 'associative-' + 'math', 'unsafe-math')

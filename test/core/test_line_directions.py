@@ -1,4 +1,4 @@
-"""Lines before frames of directions, against numpy."""
+"""Lines compared with frames of directions, against numpy."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_densities_are_those_of_the_angles_in_the_image():
 
 
 def frames(rng, count=150):
-    """With more lines than one product has factors."""
+    """Arguments with more lines than one product has factors."""
     return {
         'densities': rng.exponential(5.0, (20, count)),
         'vertical': rng.integers(0, 20, 6),

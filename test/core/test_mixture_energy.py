@@ -9,7 +9,7 @@ D = 5
 
 
 def sequence(seed=0, **other):
-    """Poses between the modes of three mixtures, of which one is of one mode."""
+    """Poses between the modes of three mixtures, one of which has one mode."""
     rng = np.random.default_rng(seed)
     whiteners = np.tril(0.3 * rng.normal(size=(7, D, D))) + np.eye(D)
     times = np.array([2, 0, 1, 0])

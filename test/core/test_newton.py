@@ -61,7 +61,7 @@ def test_any_numbers_end(name, value):
         numbers[name][...] = value
         for result in ('step', 'predicted'):
             numbers[result][...] = -77.0
-        # Each problem has its answer, whatever came in.
+        # Every problem has a result, whatever the input was.
         assert not any((result == -77.0).any() for result in taken(numbers))
 
 

@@ -1,4 +1,4 @@
-"""Gaussians around optima against numpy, and arguments that do not fit."""
+"""Gaussians around optima against numpy; invalid arguments."""
 
 import numpy as np
 import pytest

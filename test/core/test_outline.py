@@ -1,4 +1,4 @@
-"""Samples on outlines: evenly along them, with normals against the gradient of the blurred mask."""
+"""Samples on outlines: evenly spaced, with normals against the blurred mask's gradient."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The prior of poses: what does not fit is refused; values are those of the tests of the body."""
+"""The prior of poses: invalid arguments are refused; the tests of `body` check values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A processor without AVX2 gives the bytes of this one, from the versions made for it."""
+"""On a processor without AVX2, the versions made for it give the same bytes."""
 
 import shutil
 import subprocess
@@ -32,7 +32,7 @@ print(digest.hexdigest())
 @pytest.mark.skipif(not QEMU, reason='needs qemu-user-static, which stands for the processor')
 def test_a_processor_without_avx2_gives_the_same_bytes():
     def digest(*before):
-        # Not the link of a virtual environment, which would start natively.
+        # Not the link in a virtual environment, which would run natively.
         python = str(Path(sys.executable).resolve())
         path = ':'.join(filter(None, sys.path))
         done = subprocess.run(

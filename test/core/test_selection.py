@@ -1,4 +1,4 @@
-"""Choice of hypotheses: what does not fit is refused; values are those of the tests of tracking."""
+"""Choice of hypotheses: invalid arguments are refused; the tests of `tracking` check values."""
 
 from __future__ import annotations
 

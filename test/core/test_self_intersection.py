@@ -1,4 +1,4 @@
-"""Overlaps of parts: what does not fit is refused; values are those of the tests of the body."""
+"""Overlaps of parts: invalid arguments are refused; the tests of `body` check values."""
 
 from __future__ import annotations
 

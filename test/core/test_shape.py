@@ -1,4 +1,4 @@
-"""Sums over residuals by the shape: what does not fit is refused."""
+"""Sums over residuals by the shape: invalid arguments are refused."""
 
 from __future__ import annotations
 

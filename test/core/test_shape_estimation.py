@@ -1,4 +1,4 @@
-"""What modes tell of the shape, and it of them: the sums in numpy; bad input is refused."""
+"""Information of modes about the shape and back: sums in numpy; bad input is refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""States of modes and chains in the compiled core, against numpy."""
+"""States of modes and chains in the compiled core, compared with numpy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Contours and visible points in the core: against numpy, and with arguments that do not fit."""
+"""Contours and visible points in the core, compared with numpy, and invalid arguments."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def frames(body):
 
 
 def as_arguments(body, frames):
-    """Those of `trace_contour` at the first pose."""
+    """Arguments of `trace_contour` at the first pose."""
     columns, origins = (array[0] for array in frames.by_pose())
     flesh = flesh_table_of(body)
     wanted = np.ones(len(flesh.part_segments), np.bool_)
@@ -81,7 +81,7 @@ def test_parts_that_are_not_wanted_have_no_contour(body, frames):
 
 
 def wrong(place, change):
-    """Arguments whose entry at a place, of one more level or not, is another."""
+    """Arguments with one entry changed, possibly a nested one."""
 
     def changed(arguments):
         first, *rest = place
@@ -182,6 +182,6 @@ def test_points_where_nothing_is_to_be_seen(body, frames):
     nobody = seen_points(body, CAMERA, frames, np.ones((480, 640), np.bool_))
     assert isinstance(nobody, SurfacePoints)
     assert not nobody.counts.any()
-    # A mask of another size than the image, and no room.
+    # A mask of another size than the image, and no space for results.
     assert not seen_points(body, CAMERA, frames, np.ones((1, 1), np.bool_)).counts.any()
     assert not seen_points(body, CAMERA, frames, points=0).counts.any()

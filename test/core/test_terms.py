@@ -1,4 +1,4 @@
-"""The terms of the image in the core with arguments that do not fit."""
+"""The image terms in the core, with invalid arguments."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_all_terms_leave_residuals(model, inputs, frames):
     assert (residuals[:, 0, 0] > len(model.flesh.ring_parts)).all()
     assert (inputs[0].costs > 0).all()
     assert np.array_equal(residuals[0], residuals[1])
-    # Too little room: the first ones are there.
+    # With too little space only the first ones are returned.
     few = np.zeros((POSES, 11, RECORDED))
     record_residuals(model, inputs, *frames, few)
     assert (few[:, 0, 0] == 10).all()

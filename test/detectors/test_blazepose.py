@@ -1,4 +1,4 @@
-"""BlazePose: its geometry and filters, its rules with networks that cost nothing, and itself."""
+"""BlazePose: geometry and filters, rules with stub networks, and the real networks."""
 
 import math
 import os
@@ -47,7 +47,7 @@ def test_a_square_sees_and_spreads():
     image = np.stack([columns, rows, 0 * rows], axis=-1).astype(np.uint8)
     square = Square((40.0, 30.0), 32.0, math.pi / 2)
     seen = square.seen(image, 32, cv2.BORDER_CONSTANT)
-    # Turned by a quarter: what is right in the square is below in the image; RGB.
+    # Rotated by 90 degrees: right in the square is below in the image; RGB.
     np.testing.assert_array_equal(seen[4, 7], [0, 14 + 7, 56 - 4])
     spread = square.spread(seen[..., 2].astype(np.float32), (60, 80))
     np.testing.assert_allclose(spread[20:40, 30:50], columns[20:40, 30:50])
@@ -70,7 +70,7 @@ def test_points_move_to_the_heat_about_them():
     heat[..., 2] -= 10
     points = np.array([(21.5, 29.9), (0.5, 61.0), (41.0, 41.0), (-3.0, 12.0)]) / 64
     found = _refined(points, heat)
-    # By definition: the mean of nine by nine cells about that of the point.
+    # By definition: the mean of nine by nine cells around the point's cell.
     for n in (0, 1):
         column, row = np.trunc(points[n] * 64)
         near = (abs(columns - column) <= 4) & (abs(rows - row) <= 4)
@@ -102,11 +102,11 @@ def test_the_one_euro_filter_number_by_number():
             assert found[(step, *place)] == pytest.approx(smoothed, rel=1e-12)
 
 
-# ---- The rules, with stand-ins for the networks ----
+# ---- The rules, with stub networks ----
 
 
 class StandIns:
-    """Networks that see somebody as long as `seen`, and how often each was asked."""
+    """Stub networks that see a person while `seen`, with counts of their calls."""
 
     def __init__(self):
         self.seen = True
@@ -118,11 +118,11 @@ class StandIns:
     def person(self, image):
         self.asked.append('person')
         assert image.shape == (224, 224, 3)
-        # Above and below the image, which is black there.
+        # Above and below the image the square is black.
         assert image.min() == -1.0
         boxes, scores = np.zeros((2254, 12), np.float32), np.full((2254, 1), -9.0, np.float32)
         if self.seen:
-            # Twice one person, with heads 8 px apart, and a less certain one elsewhere.
+            # Two detections of one person, heads 8 px apart, and a less certain person elsewhere.
             for n, score, shift in ((1000, 2.0, 0.0), (1001, 2.0, 8.0), (0, 1.0, 0.0)):
                 scores[n] = score
                 boxes[n, 2:8] = 60.0, 60.0, 0.0, 40.0, shift, 0.0
@@ -161,7 +161,7 @@ def test_somebody_is_sought_once_and_then_followed(networks):
         assert detector.detect(IMAGE, INTERVAL * (index + 1)) is not None
     assert networks.asked == ['person', *['landmarks'] * 3]
     networks.seen = False
-    # Lost, and then sought in each image.
+    # After a loss the person is searched in each image.
     assert [detector.detect(IMAGE, INTERVAL * (4 + i)) for i in range(3)] == [None] * 3
     assert networks.asked[4:] == ['landmarks', 'person', 'person']
 
@@ -181,7 +181,7 @@ def test_landmarks_are_keypoints(networks):
     np.testing.assert_allclose(found.pixels[2:], np.tile(middle - 0.5, (31, 1)), atol=1e-4)
     np.testing.assert_allclose(found.confidences[:2], [1 / (1 + math.exp(-3)), 0.5])
     assert found.positions is not None
-    # In the axes of the camera, not in those of the square.
+    # In camera axes, not in those of the square.
     np.testing.assert_allclose(
         found.positions[1], [*np.array([0.1, 0.2]) @ square.axes, 0.3], atol=1e-6
     )

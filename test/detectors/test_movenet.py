@@ -1,4 +1,4 @@
-"""MoveNet: its graph as ONNX, its cells, its opinion beside BlazePose's, and itself."""
+"""MoveNet: its graph as ONNX, its cells, its combination with BlazePose, and the real one."""
 
 import base64
 import json
@@ -87,7 +87,7 @@ def small_graph():
 
 
 def convolved(image, kernel, stride, *, each=False):
-    """By definition, with what is odd of the border after the image; (H, W, C)."""
+    """Convolution by definition, with odd padding after the image; (H, W, C)."""
     size = len(kernel)
     around = max(size - stride, 0)
     before = around // 2
@@ -128,7 +128,7 @@ def test_an_operation_that_is_not_known_is_told():
 
 def test_landmarks_are_sought_where_the_centre_expects_them():
     heat = np.zeros((2, 64, 64), np.float32)
-    # Two persons; the landmarks of the wrong one are the surest.
+    # Two persons; the wrong one has the most confident landmarks.
     heat[0, 10, 20], heat[0, 50, 20] = 0.5, 0.9
     heat[1, 12, 24], heat[1, 52, 24] = 0.5, 0.9
     centre = np.zeros((64, 64), np.float32)
@@ -141,12 +141,12 @@ def test_landmarks_are_sought_where_the_centre_expects_them():
     np.testing.assert_allclose(found, expected)
 
 
-# ---- Beside BlazePose, with a stand-in for each ----
+# ---- Combination with BlazePose, with a stub for each ----
 
 
 @pytest.fixture
 def pair(monkeypatch):
-    """What the two find: keypoints; landmarks (17, 3), and the images that were seen."""
+    """Stubs of the two detectors, with their results and the images that they got."""
 
     class First:
         found: Keypoints | None = None
@@ -181,7 +181,7 @@ def test_movenet_sees_what_lies_in_the_image(pair):
     pixels = np.tile([100.0, 120.0], (33, 1))
     pixels[0], pixels[NAMES.index('left_ankle')] = (100.0, 40.0), (100.0, 400.0)
     first.found = keypoints(pixels)
-    # All landmarks in the middle of the square, the surer half of them.
+    # All landmarks are in the middle of the square, with higher confidence.
     second.told = np.tile([0.5, 0.5, 0.9], (17, 1))
     second.told[11:, 2] = 0.29
     image = np.zeros((240, 320, 3), np.uint8)
@@ -198,7 +198,7 @@ def test_movenet_sees_what_lies_in_the_image(pair):
         np.testing.assert_allclose(other, (own + 2 * middle) / 3 if counted else own)
     assert found.positions is first.found.positions
     assert detector.mask.all()
-    # A landmark outside is not asked for; nobody is nobody.
+    # Landmarks outside are ignored; without a person there is no result.
     second.told[:, 2] = 0.9
     row = NAMES.index('left_ankle')
     assert (detector.detect(image, 2).pixels[row] == pixels[row]).all()
@@ -229,7 +229,7 @@ def test_what_differs_is_unsure():
     expected = sigma**2 * np.eye(2) + [[2.25, -4.5], [-4.5, 9.0]]
     np.testing.assert_allclose(mean.covariances[13], expected)
     np.testing.assert_array_equal(mean.confidences, found.confidences)
-    # They are those of a joint in the tracker: the others have the noise of their confidence.
+    # Only landmarks of the tracker's joints have this noise, others that of their confidence.
     known, _ = mean.named_for(load_body('human37'))
     row = known.names.index('left_elbow')
     np.testing.assert_allclose(known.covariances[row], expected)

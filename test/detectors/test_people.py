@@ -1,4 +1,4 @@
-"""Identities of several people, with networks that cost nothing: bodies are coloured bars."""
+"""Identities of several people, with stub networks: bodies are coloured bars."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 NAMES = schemes()[SCHEME].names
 WIDTH, HEIGHT = 640, 480
 RED, GREEN, BLUE, WHITE = (40, 40, 200), (40, 180, 40), (200, 60, 40), (230, 230, 230)
-# Where the landmarks of the trunk and the legs are, in heights from the middle of the hips.
+# Landmarks of trunk and legs relative to the middle of the hips, in heights.
 PLACES = {
     'left_shoulder': (0.1, -0.3), 'right_shoulder': (-0.1, -0.3), 'left_hip': (0.07, 0.0),
     'right_hip': (-0.07, 0.0), 'left_knee': (0.07, 0.25), 'right_knee': (-0.07, 0.25),
@@ -25,7 +25,7 @@ BODY = np.array([PLACES.get(x, (0.0, -0.4)) for x in NAMES])
 
 
 class Person:
-    """A bar of one colour, by its middle and height, px; `order`: the nearest is drawn last."""
+    """A bar of one colour, by its middle and height, px; bars are drawn in `order`."""
 
     def __init__(self, colour, path, height=200.0):
         self.colour, self.path, self.height = colour, path, height
@@ -35,7 +35,7 @@ class Person:
 
 
 class Scene:
-    """The networks of a scene: they see the people whom nobody nearer hides."""
+    """Stub networks of a scene, which see the people that are not hidden."""
 
     def __init__(self, people, noise=0.0):
         self.people, self.time, self.hidden = people, 0.0, ()
@@ -57,7 +57,7 @@ class Scene:
         return image
 
     def seen(self):
-        """People, the nearest first, without those hidden by a nearer one."""
+        """Visible people, nearest first."""
         result = []
         for person in reversed(self.people):
             near = [
@@ -105,7 +105,7 @@ def walking(start, end, y=240.0, duration=3.0):
 
 
 def names_over(scene, *, seconds=3.0, rate=15.0, most=4, start=10**9, detector=None):
-    """Names by image of the person of the scene whom each detection is nearest to."""
+    """Identities in each image, by the nearest person of the scene."""
     detector = detector or PeopleDetector(most, scene)
     result = []
     for number in range(round(seconds * rate)):
@@ -124,7 +124,7 @@ def names_over(scene, *, seconds=3.0, rate=15.0, most=4, start=10**9, detector=N
 
 
 def kept(names, person):
-    """The names that a person had, without repetitions."""
+    """The identities of a person, without repetitions."""
     return list(dict.fromkeys(x[person] for x in names if person in x))
 
 
@@ -140,7 +140,7 @@ def test_people_who_stand_keep_their_names(rate):
 @pytest.mark.parametrize('rate', [30.0, 8.0])
 @pytest.mark.parametrize('colours', [(RED, GREEN), (RED, RED)])
 def test_two_who_cross(rate, colours):
-    """In the same clothes, too, if both go on as before."""
+    """Also in the same clothes, if both keep their direction."""
     people = [Person(c, walking(*x)) for c, x in zip(colours, ((120, 520), (500, 100)))]
     names = names_over(Scene(people, noise=1.0), rate=rate)
     assert [len(kept(names, x)) for x in people] == [1, 1]
@@ -149,7 +149,7 @@ def test_two_who_cross(rate, colours):
 
 
 def test_two_who_meet_and_turn_round():
-    """Their places say that they went on; their clothes say that they did not."""
+    """Positions suggest that they crossed; clothes show that they did not."""
 
     def there_and_back(start, end):
         return lambda t: (start + (end - start) * (1 - abs(t - 1.5) / 1.5), 240.0)
@@ -190,7 +190,7 @@ def test_seven_people_of_whom_four_are_wanted():
     found = detector.detect(scene.image(), 10**9)
     assert len(found) == 4
     assert detector.left_out == 3
-    # The largest.
+    # The largest person.
     assert min(x.corners[0, 0] for x in found) > 250
 
 

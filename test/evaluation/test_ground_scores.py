@@ -1,4 +1,4 @@
-"""Feet against the floor, on feet whose scores are known."""
+"""Scores of feet against the floor, for feet whose scores are known."""
 
 import json
 
@@ -15,7 +15,7 @@ STEP = SECOND // 10
 
 
 def ground_of(view, standing=(True, False), moved=(0.0, 0.0, 0.0)):
-    """The floor as a camera sees it that stands elsewhere in the world."""
+    """The floor in the frame of a camera that stands elsewhere in the world."""
     return TrueGround(
         view.rotation[:, 2],
         view.height,
@@ -26,7 +26,7 @@ def ground_of(view, standing=(True, False), moved=(0.0, 0.0, 0.0)):
 
 
 def in_the_camera(view, feet, moved=(0.0, 0.0, 0.0)):
-    """Joints of feet at places (4, 3) in the world, m."""
+    """Joints of the feet in the camera frame, from places (4, 3) in the world, m."""
     return view.to_camera(np.vstack([[0.0, 0.0, 1.0], feet]) - np.array(moved))
 
 

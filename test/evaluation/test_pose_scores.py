@@ -1,4 +1,4 @@
-"""Errors and calibration of pose mixtures against hand-made truth."""
+"""Errors and calibration of pose mixtures with synthetic truth."""
 
 import numpy as np
 import pytest
@@ -135,7 +135,7 @@ def test_density_is_that_of_scipy(body):
 
 @pytest.mark.parametrize('inflation', [1.0, 0.4, 2.5])
 def test_coverage_tells_honest_mixtures_from_others(body, inflation):
-    """Truth drawn from the mixtures is covered as often as it should; not from narrower ones."""
+    """Coverage is correct for truth drawn from the mixtures, but not for wrong widths."""
     rng = np.random.default_rng(3)
     honest = joint_mixtures(body, pose_mixtures(body, 200, spread=0.1))
     truth = np.array([m.density().sample(1, rng)[0].reshape(-1, 3) for m in honest])

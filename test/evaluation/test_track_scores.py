@@ -1,4 +1,4 @@
-"""Tracks against made-up truth: matching by stamp, windows, batches, and errors of the modes."""
+"""Tracks with synthetic truth: matching by timestamp, windows, batches, errors of modes."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Data that the tests of the experts share."""
+"""Data shared by the tests of the experts."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from test.oracles.branching import toy
 
 
 def branches(count, seed, inputs=6, outputs=3):
-    """Targets on one of two branches, of which the inputs say nothing for half of the circle."""
+    """Targets on one of two branches, which the inputs do not tell apart on half the circle."""
     shape = np.random.default_rng(7)
     mix_in, mix_out = shape.normal(size=(3, inputs)), shape.normal(size=(4, outputs))
     rng = np.random.default_rng(seed)

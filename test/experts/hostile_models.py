@@ -1,4 +1,4 @@
-"""A small model of every kind that files hold, and what is asked of each."""
+"""A small model of every kind stored in files, and checks of each."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def _calibrated(model) -> CalibratedExperts:
 
 
 def densities() -> dict[str, object]:
-    """A model of each kind over inputs and targets that are not of a body."""
+    """A model of each kind, for inputs and targets unrelated to bodies."""
     rng = np.random.default_rng(1)
     x = rng.normal(size=(80, 4))
     y = np.c_[np.sin(2.0 * x[:, :2]), x[:, 2] * x[:, 3]] + 0.1 * rng.normal(size=(80, 3))
@@ -85,7 +85,7 @@ def densities() -> dict[str, object]:
 
 
 def small_predictor() -> PosePredictor:
-    """A predictor with a model for rule (1), of a few samples drawn from the one that ships."""
+    """A predictor with a model for rule (1), from a few samples of the bundled one."""
     shipped, rng = load_predictor(), np.random.default_rng(2)
     x = rng.normal(size=(40, shipped.descriptor.size))
     z = np.array([one.mean() for one in shipped.model.predict(x)])
@@ -125,7 +125,7 @@ def small_lifter() -> Lifter:
 
 
 def models() -> dict[str, object]:
-    """A model of every kind that files hold."""
+    """A model of every kind stored in files."""
     return {
         **densities(),
         'silhouettes': load_predictor(),
@@ -151,7 +151,7 @@ MASK, KEYPOINTS = _person()
 
 
 def predictions(model: object) -> list[GaussianMixture]:
-    """Mixtures that a model predicts for inputs near and far from those that it has learned from.
+    """Mixtures that a model predicts for inputs near to and far from its training data.
 
     Raises:
         AssertionError: derivatives or supports are not finite.

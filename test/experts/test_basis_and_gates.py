@@ -1,4 +1,4 @@
-"""Basis functions and gates: derivatives, identities, and the bound that gates may not lower."""
+"""Basis functions and gates: derivatives, identities, and the bound, which must not decrease."""
 
 import numpy as np
 import pytest

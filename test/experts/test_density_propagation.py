@@ -1,4 +1,4 @@
-"""Propagation of mixtures against samples, grids and closed forms."""
+"""Propagation of mixtures, compared with samples, grids and closed forms."""
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def previous():
 
 
 def samples_through(model, previous, observation, count, rng):
-    """Draws of p(x_t | R_t): a state before, then the model's own mixture there."""
+    """Draws of p(x_t | R_t): a previous state, then the model's mixture for it."""
     states = previous.sample(count, rng)
     inputs = np.hstack([states, np.broadcast_to(observation, (count, len(observation)))])
     weights, means, covariances = model.predict_arrays(inputs)
@@ -73,7 +73,7 @@ def test_products_agree_with_samples(linear_model, previous, rng):
     draws = samples_through(linear_model, previous, observation, 200_000, rng)
     np.testing.assert_allclose(found.mean(), draws.mean(0), atol=0.03)
     np.testing.assert_allclose(found.covariance(), np.cov(draws.T), atol=0.06)
-    # Draws are as probable under the mixture as the mixture's own.
+    # Draws have the same mean log density as samples of the mixture.
     own = found.log_density(found.sample(200_000, rng)).mean()
     assert found.log_density(draws).mean() == pytest.approx(own, abs=0.05)
 
@@ -105,7 +105,7 @@ def test_kernel_experts_agree_with_samples(kernel_model, rng):
 
 
 def test_rule_one_on_a_grid(linear_model):
-    """The integral of rule (1) over a grid of states before, in two dimensions."""
+    """The integral of rule (1) over a grid of previous states, in two dimensions."""
     before = GaussianMixture(
         [0.6, 0.4], [[0.0, 0.4], [-0.8, 0.1]], np.array([0.03, 0.05])[:, None, None] * np.eye(2)
     )

@@ -1,4 +1,4 @@
-"""The mixtures of experts as models: likelihood, bound, oracles, files, bad input."""
+"""Mixtures of experts: likelihood, bound, oracles, files, bad input."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def test_three_experts_follow_three_branches(model, least, toy_pairs, toy_test):
     gates, means, _ = found.predict_arrays(np.array([[0.5], [-0.05], [1.05]]))
     assert (gates[0] > 0.1).all()
     np.testing.assert_allclose(np.sort(means[0, :, 0]), [0.21, 0.5, 0.79], atol=0.03)
-    # Where one branch exists, one gate has it all.
+    # With one branch, one gate has all the weight.
     assert gates[1].max() > 0.95
     assert gates[2].max() > 0.95
     assert gates[1].argmax() != gates[2].argmax()
@@ -107,7 +107,7 @@ def test_same_seed_same_model(branch_pairs):
 
 @pytest.mark.parametrize('name', ['conditional', 'joint'])
 def test_regions_cover_new_samples(learned, name, make_branches):
-    """90 % of new targets lie in the 90 % region of their nearest expert, 80 to 97 at least."""
+    """The 90 % region of the nearest expert contains 80 to 97 % of new targets."""
     inputs, targets = make_branches(1000, 2)
     _, means, covariances = learned[name].predict_arrays(inputs)
     offsets = targets[:, None] - means
@@ -197,12 +197,12 @@ def test_bad_parameters_are_named(parameters, message, branch_pairs):
 
 
 def test_experts_come_near_the_truth_of_the_toy(toy_pairs, toy_test):
-    """log p(y | x) in nats: of the truth 1.23, of one regression 0.18."""
+    """log p(y | x) in nats is 1.23 for the truth and 0.18 for one regression."""
     assert true_log_density(*toy_test).mean() == pytest.approx(1.227, abs=0.03)
     for model in (ConditionalExperts, JointExperts):
         found = model(3, seed=0).fit(*toy_pairs)
         assert found.log_density(*toy_test).mean() > 1.0
-        # Where the toy has one branch, experts of that branch have the weight.
+        # If the toy has one branch, its experts have the weight.
         weights, means, _ = found.predict_arrays(np.array([[-0.05], [0.0], [1.0], [1.05]]))
         heaviest = means[np.arange(4), weights.argmax(1)]
         near = np.abs(means - heaviest[:, None])[:, :, 0] < 0.15

@@ -1,4 +1,4 @@
-"""Models of nonsense, with a right checksum: refused when they are read, or they predict."""
+"""Corrupt models with a valid checksum are either refused when read or able to predict."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from hmt_ros.experts.conditional_density import ConditionalDensity, stored_model
 from test.experts.hostile_models import BODY, check_predictions, models
 from test.forged_models import arrays_of, forged, mutations
 
-# Mutations of each model that are tried.
+# Number of mutations tried of each model.
 TRIED = 120
 MODELS = models()
 
 
 def reader(model):
-    """The function that makes a model of this kind from arrays."""
+    """The function that makes a model of the same kind from arrays."""
     if isinstance(model, AngleMixture):
         return partial(AngleMixture.from_arrays, skeleton=BODY.skeleton)
     return stored_model if isinstance(model, ConditionalDensity) else type(model).from_arrays
@@ -34,7 +34,7 @@ def saved(model, path):
 
 
 def loaded(arrays, read):
-    """The model, or None and why it is refused; any other exception than ValueError is a fault."""
+    """The model, or None and the reason for the refusal; only a ValueError is a refusal."""
     try:
         with named_faults('model'):
             return checked_model(arrays, read), ''

@@ -1,4 +1,4 @@
-"""Model files: what is refused, and how it is said."""
+"""Model files: refused files, and their error messages."""
 
 import numpy as np
 import pytest

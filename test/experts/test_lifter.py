@@ -56,7 +56,7 @@ def walking(count: int = 12) -> np.ndarray:
 
 
 def detected(poses: np.ndarray, scheme: str = 'mediapipe33', body=BODY) -> list[Keypoints]:
-    """Exact keypoints of poses."""
+    """Exact keypoints of poses, in a scheme."""
     names = schemes()[scheme].names
     known, rows = [], []
     for i, mark in enumerate(schemes()[scheme].landmarks):
@@ -159,7 +159,7 @@ def test_windows_take_the_nearest_images():
 
 
 def test_inputs_do_not_depend_on_where_the_person_is_in_the_image():
-    """A camera that turns sees the same person: the inputs are those of one that looks there."""
+    """A rotated camera sees the same person and gives the same inputs."""
     rng = np.random.default_rng(0)
     rays = 0.1 * rng.normal(size=(1, len(TIMES), len(LANDMARKS), 2))
     sure = np.ones((1, len(TIMES), len(LANDMARKS)))
@@ -168,13 +168,13 @@ def test_inputs_do_not_depend_on_where_the_person_is_in_the_image():
     turn = ray_rotations(np.array([[0.0, 0.3, 1.0]]))[0]
     moved = np.concatenate([rays, np.ones((*rays.shape[:3], 1))], axis=3) @ turn.T
     second = window_inputs(moved[..., :2] / moved[..., 2:], sure, TIMES[None], ups @ turn.T, none)
-    # The camera looks at the mean of the trunk, which is not that of the rays turned.
+    # Axes point to the mean of the trunk, which differs slightly from the mean of rotated rays.
     np.testing.assert_allclose(first.values, second.values, atol=0.05)
 
 
 @pytest.mark.parametrize('degrees', [15.0, 90.0, 180.0])
 def test_a_camera_on_its_side_lifts_as_an_upright_one(degrees):
-    """Keypoints of a turned camera with its gravity: the same poses, turned."""
+    """Keypoints and gravity of a rotated camera give the same poses, rotated."""
     shipped, poses = load_lifter(), walking(8)
     turn = Rotation.from_rotvec([0.0, 0.0, np.radians(degrees)]).as_matrix()
     middle, up = np.array([CAMERA.cx, CAMERA.cy]), np.array([0.0, -np.cos(0.1), -np.sin(0.1)])
@@ -186,7 +186,7 @@ def test_a_camera_on_its_side_lifts_as_an_upright_one(degrees):
     for one, other in zip(upright, found, strict=True):
         joints = BODY.joint_positions(one.means[:1]) @ turn.T
         assert np.abs(BODY.joint_positions(other.means[:1]) - joints).max() < 5e-3
-    # Nothing is turned where gravity is not known, or the camera is level.
+    # Nothing is rotated if gravity is unknown or the camera is level.
     unknown = lift_poses(shipped, BODY, CAMERA, stamps, seen)
     level = lift_poses(shipped, BODY, CAMERA, stamps, seen, np.zeros((8, 3)))
     assert np.array_equal(unknown[0].means, level[0].means)
@@ -242,7 +242,7 @@ def test_inputs_are_exchanged_as_landmarks_are(order):
 
 
 def test_exchanged_sides_are_among_the_answers():
-    """Poses near a person whose sides are exchanged get some of the weight."""
+    """Poses near the person with exchanged sides get some weight."""
     poses, stamps = turned(walking(20), [0, 1, 0], 20), np.arange(20) / 30.0
     seen = [exchanged(one) for one in detected(poses)]
     rays, sure = (np.array([landmark_rays(CAMERA, x)[i] for x in seen]) for i in range(2))
@@ -308,7 +308,7 @@ def test_poses_have_the_lifted_joints_where_the_keypoints_are():
         assert np.linalg.eigvalsh(mixture.covariances).min() > 0
         assert (mixture.means >= BODY.lower - 1e-9).all()
         assert (mixture.means <= BODY.upper + 1e-9).all()
-        # How far away the person is depends on the size.
+        # The distance of the person depends on the size.
         depth = mixture.covariances[0, 2, 2] ** 0.5
         assert depth == pytest.approx(0.06 * mixture.means[0, 2], rel=0.3)
 
@@ -373,7 +373,7 @@ def tracks():
 
 
 def test_training_windows_show_what_the_camera_sees():
-    """Without errors the rays of a window are those of the joints that are to be learned."""
+    """Without errors the rays of a window are those of the joints to be learned."""
     exact = WindowSettings(
         noise=0.0, gravity=1.0, gravity_spread=0.0, lengths=1.0, lengths_spread=0.0, cut=0.0,
         unusual=0.0, near=0.0, recombined=0.0, seated=0.0,
@@ -382,7 +382,7 @@ def test_training_windows_show_what_the_camera_sees():
     values, joints = training_windows(found, 400, rng, exact, 0)
     assert values.shape == (400, INPUTS)
     assert joints.shape == (400, len(JOINTS), 3)
-    # Knees of the first image lie about where the knees of the pose do.
+    # Rays of the knees in the first image agree with the pose.
     count = len(LANDMARKS)
     plane = values[:, : 2 * count].reshape(400, count, 2)
     hips = [LANDMARKS.index(name) for name in HIPS]
@@ -414,7 +414,7 @@ def test_a_person_of_three_tracks_holds_together():
         for side in ('left', 'right'):
             distance = np.linalg.norm(made[f'{side}_{above}'] - made[f'{side}_{below}'], axis=1)
             np.testing.assert_allclose(distance, BODY.segment_lengths[length], atol=1e-4)
-    # Arms of another track are not those of this one, legs are.
+    # The arms come from another track, the legs from this one.
     own = assembled(found, found.joints, JOINTS, np.repeat(rows[:1], 3, axis=0))[:, 0]
     other = which[2] != which[0]
     wrists = np.linalg.norm(own[:, JOINTS.index('left_wrist')] - made['left_wrist'], axis=1)
@@ -452,7 +452,7 @@ def test_people_sit_in_some_windows():
     rng, sits = np.random.default_rng(0), WindowSettings(noise=0.0, seated=1.0, unusual=0.0)
     _, joints = training_windows(tracks(), 200, rng, sits, 0)
     thigh = joints[:, JOINTS.index('left_knee')] - joints[:, JOINTS.index('left_hip')]
-    # The view looks down a little: a thigh that points ahead is far from upright.
+    # The camera looks down a little; a thigh that points ahead is far from upright.
     assert np.median(np.abs(thigh[:, 1])) < 0.6 * BODY.segment_lengths['thigh']
 
 
@@ -493,7 +493,7 @@ def test_errors_grow_with_their_factor():
     ratio = np.median(np.abs(large)) / np.median(np.abs(small))
     assert ratio == pytest.approx(2.0, rel=0.1)
     assert ((seen >= 0) & (seen <= 1)).all()
-    # Errors last: neighbours in time are alike, more than those far apart.
+    # Errors are correlated in time, more for neighbouring than for distant images.
     x = small[..., 0].reshape(400, len(TIMES), -1)
     near = np.corrcoef(x[:, 0].ravel(), x[:, 1].ravel())[0, 1]
     far_apart = np.corrcoef(x[:, 0].ravel(), x[:, 5].ravel())[0, 1]
@@ -520,7 +520,7 @@ def test_learning_gains_and_repeats(tmp_path):
     inputs, joints = training_windows(found, 300, np.random.default_rng(9), windows)
     scores = lifter_scores(lifter, inputs, joints)
     assert scores.best <= scores.heaviest < 0.3
-    # What was marked at the last step is the same lifter.
+    # Resuming from the checkpoint of the last step gives the same lifter.
     again = learn_lifter(BODY, found, settings, windows, {}, None, tmp_path / 'mark.npz')
     assert all(
         np.array_equal(getattr(lifter.network, name), getattr(again.network, name))
@@ -531,11 +531,11 @@ def test_learning_gains_and_repeats(tmp_path):
         learn_lifter(BODY, found, other, windows, {}, None, tmp_path / 'mark.npz')
 
 
-# What ships, on persons and keypoints that training has seldom seen or never.
+# The bundled lifter, on persons and keypoints that are rare in training or absent.
 
 
 def turned(poses, axis, degrees):
-    """Poses of somebody turned about an axis of the camera."""
+    """Poses of a person rotated about an axis of the camera."""
     turn = Rotation.from_rotvec(np.radians(degrees) * np.array(axis)).as_matrix()
     result = poses.copy()
     result[:, 3:6] = root_angles(BODY, turn @ root_rotations(BODY, poses))
@@ -579,7 +579,7 @@ CASES = {
 
 @pytest.mark.parametrize('name', CASES)
 def test_no_confident_wrong_pose(name):
-    """Where the heaviest pose is wrong the deviations are as large as its errors of depth."""
+    """If the heaviest pose is wrong, its deviations are as large as its depth errors."""
     of, more, most = CASES[name]
     size = more.get('size', 1.0)
     body = BODY.with_segment_lengths({k: size * v for k, v in BODY.segment_lengths.items()})
@@ -607,7 +607,7 @@ def test_without_confidence_there_is_no_pose():
 
 
 def test_two_people_mixed_are_wide():
-    """Keypoints of two people who face opposite ways: nothing narrow comes of them."""
+    """Keypoints of two people who face opposite ways give no narrow mixture."""
     poses, rng = walking(10), np.random.default_rng(0)
     pairs = zip(detected(poses), detected(turned(poses, [0, 1, 0], 180)))
     seen = [
@@ -621,7 +621,7 @@ def test_two_people_mixed_are_wide():
 
 @pytest.mark.parametrize('scheme', sorted(schemes()))
 def test_any_networks_pose_is_a_guess_of_the_whole(scheme: str) -> None:
-    """Where a joint lacks positions, as the neck of COCO, the depths of the others are there."""
+    """If a joint has no position, such as COCO's neck, the others still have depths."""
     pose = BODY.prior_mean.copy()
     pose[:3] = 0.2, 0.0, 4.0
     frames = forward(BODY.skeleton, pose[None])
@@ -645,5 +645,5 @@ def test_any_networks_pose_is_a_guess_of_the_whole(scheme: str) -> None:
     middle = joints[BODY.skeleton.joint_index(HIPS)].mean(0)
     true = (joints[BODY.skeleton.joint_index(found.joints)] - middle) @ found.axes.T
     off = np.abs(found.means[0, :, 2] - true[:, 2])
-    # Landmarks lie on the skin, those of the wrist farthest from their joint.
+    # Landmarks lie on the skin; those of the wrist are farthest from their joint.
     assert off[[found.joints.index(x) for x in sorted(limbs)]].max() < 0.08

@@ -1,4 +1,4 @@
-"""Local experts, and weighted nearest neighbours against a brute-force search."""
+"""Local experts, and weighted nearest neighbours compared with a brute-force search."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_jacobians_where_neighbours_stay() -> None:
     point = np.array([[0.1, -0.2]])
     found = model.jacobians(point)[0]
     h = 1e-5
-    # The width of the kernel is held: it is that of the neighbours at the point.
+    # The kernel width is fixed to that of the neighbours at the point.
     distances, index = model._neighbours(point, 25)
     width = distances[0, -1]
     _, _, shares, _ = model._modes(distances, index)

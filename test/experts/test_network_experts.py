@@ -1,4 +1,4 @@
-"""Experts of one network: what it computes against derivatives, files, and what it learns."""
+"""Experts of one network: its outputs and derivatives, its files, and what it learns."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_jacobians_are_those_of_the_means():
         ahead[:, i] += step
         behind[:, i] -= step
         found = (made.components(ahead).means - made.components(behind).means) / (2 * step)
-        # Units that bend within the step differ.
+        # Units whose slope changes within the step differ.
         close = np.isclose(slopes[..., i], found, atol=5e-3).mean()
         assert close > 0.9
 

@@ -52,7 +52,7 @@ def test_a_target_is_that_of_an_upright_camera(encoding: PoseEncoding) -> None:
     targets = encoding.encode(poses)
     np.testing.assert_allclose(there.encode(moved), targets, atol=1e-12)
     np.testing.assert_allclose(there.decode(targets, moved[:, :3]), moved, atol=1e-9)
-    # Derivatives by roots and poses turn with the camera.
+    # Derivatives by roots and poses rotate with the camera.
     for name, given in (('jacobians', (targets, poses[:, :3])), ('encoding_jacobians', (poses,))):
         upright = getattr(encoding, name)(*given)
         turned = getattr(there, name)(*given[:-1], moved if len(given) == 1 else moved[:, :3])

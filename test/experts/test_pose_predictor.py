@@ -42,7 +42,7 @@ def predictor(body: Body, training: Described) -> PosePredictor:
 
 @pytest.fixture(scope='module')
 def clip(body: Body) -> tuple[np.ndarray, np.ndarray]:
-    """Poses and masks of a walk that was not learned from."""
+    """Poses and masks of a walk outside the training data."""
     poses = procedural_sequence('walk', body, 1.2, 9).poses[::2].copy()
     poses[:, :3] += [0.3, 0.0, 4.2] - poses[:, :3].mean(0)
     return poses, render_silhouettes(body, poses, CAMERA)
@@ -84,14 +84,14 @@ def test_a_camera_on_its_side_predicts_as_an_upright_one(
     index = body.skeleton.joint_index(['pelvis', *EVALUATED_JOINTS])
     best = []
     for pose, mask in zip(*clip, strict=True):
-        # The image is turned clockwise, about its centre.
+        # The image is rotated clockwise about its centre.
         seen = np.ascontiguousarray(np.rot90(mask, -quarters))
         found = predictor.with_body(level).observe(seen, camera).mixture
         joints = level.joint_positions(found.means)[:, index] @ turn
         true = body.joint_positions(pose[None])[:, index]
         away = (joints - joints[:, :1]) - (true - true[:, :1])
         best.append(np.linalg.norm(away[:, 1:], axis=2).mean(1).min())
-    # As of the upright camera.
+    # As for the upright camera.
     assert np.mean(best) < 0.09
 
 
@@ -116,7 +116,7 @@ def test_a_file_brings_it_back(
     again = PosePredictor.load(path)
     assert again.body.segment_lengths == predictor.body.segment_lengths
     one, two = (x.predict(clip[1][2], CAMERA) for x in (predictor, again))
-    # Kept in half precision.
+    # Stored in half precision.
     np.testing.assert_allclose(two.means[0], one.means[0], atol=0.01)
     assert path.read_bytes() == predictor.save(tmp_path / 'other.npz').read_bytes()
     with zipfile.ZipFile(path) as archive:
@@ -129,7 +129,7 @@ def test_another_person(
 ) -> None:
     tall = predictor.with_body(body.with_stature(1.2 * body.stature))
     one, two = (x.predict(clip[1][0], CAMERA) for x in (predictor, tall))
-    # The same silhouette of a larger person is further away.
+    # A larger person with the same silhouette is further away.
     ratio = np.linalg.norm(two.means[0, :3]) / np.linalg.norm(one.means[0, :3])
     assert ratio == pytest.approx(1.2, abs=0.02)
 

@@ -37,7 +37,7 @@ def test_the_root_of_a_known_posture_is_found(body: Body, poses: np.ndarray) -> 
     for pose, place in zip(poses, seen(body, poses), strict=True):
         target = encoding.encode(pose[None])
         found = place_roots(encoding, CAMERA, place, target, small(encoding))
-        # A pixel of the box is 0.4 % of its height, and so of the depth.
+        # A pixel of the box is 0.4 % of its height, and thus of the depth.
         np.testing.assert_allclose(found.roots[0], pose[:3], atol=0.035)
         assert not any(place.cut)
 
@@ -133,7 +133,7 @@ def test_samples_of_the_placed_gaussian_have_the_box(body: Body, poses: np.ndarr
     samples = np.random.default_rng(0).multivariate_normal(mean, spread, 40)
     boxes = np.array([x.box for x in seen(body, np.clip(samples, body.lower, body.upper))])
     height = place.box[3] - place.box[1]
-    # Placed for themselves the samples would spread by the noise that is allowed for, 2 %.
+    # Independently placed samples would spread by the assumed noise, 2 %.
     assert np.abs(boxes.mean(0) - place.box).max() < 0.02 * height
     assert boxes.std(0).max() < 0.04 * height
 

@@ -1,4 +1,4 @@
-"""Sparse Bayesian regression against the dense marginal likelihood, written out."""
+"""Sparse Bayesian regression, compared with the dense marginal likelihood."""
 
 import numpy as np
 import pytest
@@ -164,7 +164,7 @@ def test_equal_candidates_are_taken_once(problem, prior):
 
 
 def test_tails_of_kernels_get_no_weight_without_bounds(prior):
-    """Seen by their tails alone kernels would say anything near their centres."""
+    """Kernels with only tails in the data would be arbitrary near their centres."""
     rng = np.random.default_rng(1)
     r = rng.uniform(0.0, 1.0, (200, 1))
     centres = np.array([[4.0, 5.0, 6.0, 8.0]])
@@ -198,7 +198,7 @@ def test_climbs_monotonously_from_any_start(problem, prior):
 
 
 def test_prediction_covers_what_it_should():
-    """90 % regions of new samples, whose noise is known, over repeated training sets."""
+    """Coverage of 90 % regions for new samples with known noise, over repeated training sets."""
     rng = np.random.default_rng(5)
     inside = []
     for _ in range(20):

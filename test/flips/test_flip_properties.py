@@ -1,4 +1,4 @@
-"""What holds for every leaf, at poses that hypothesis draws."""
+"""Invariants of every leaf, at poses drawn by hypothesis."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NAMES = BODY.dof_names
 LIMITED = np.minimum(BODY.upper, np.pi) - np.maximum(BODY.lower, -np.pi)
 TURNS = BODY.skeleton.dof_is_rotation
 ARM = ('left_shoulder', 'left_elbow', 'left_wrist', 'left_hand')
-# All joint angles may take all values.
+# The body without joint limits.
 FREE = replace(
     BODY,
     skeleton=replace(
@@ -30,20 +30,20 @@ FREE = replace(
 
 @st.composite
 def poses(draw, fixed=()):
-    """Poses within the limits, 2 to 5 m before the camera; some angles may be given."""
+    """Poses within the limits, 2 to 5 m in front of the camera; some angles can be given."""
     share = np.array(draw(st.lists(st.floats(0, 1), min_size=34, max_size=34)))
     pose = np.where(TURNS, np.maximum(BODY.lower, -np.pi) + share * LIMITED, share - 0.5)
     pose[2] += 3.5
     pose = np.clip(pose, BODY.lower, BODY.upper)  # rounding
     for name, value in dict(fixed).items():
         pose[NAMES.index(name)] = value
-    # A pose within the limits may still put a joint behind the camera, which then has no image.
+    # A joint of a valid pose may still be behind the camera, without an image.
     assume((BODY.joint_positions(pose[None])[..., 2] > 0.1).all())
     return pose
 
 
 def bones(body: Body, found):
-    """Lengths of the bones, but from the pelvis to the neck: between them the trunk turns."""
+    """Lengths of the bones, without that from pelvis to neck, which the trunk changes."""
     joints, neck = body.joint_positions(found), body.joint_names.index('neck')
     rigid = [(a, b) for a, b in body.skeleton.bones if (body.joint_names[a], b) != ('pelvis', neck)]
     return np.stack([np.linalg.norm(joints[:, a] - joints[:, b], axis=1) for a, b in rigid])
@@ -60,13 +60,13 @@ def off_rays(found, pose, names=None):
 
 
 def faults_of(pose, found):
-    """What does not hold of image, lengths and limits, and that the pose is one of its leaves."""
+    """Violated invariants: image, lengths, limits, and that the pose is one of its leaves."""
     holds = {
         'pose': np.abs(found - pose).max(1).min() == 0.0,
         'lengths': np.abs(bones(BODY, found) - bones(BODY, pose[None])).max() < 1e-9,
         'lower limits': (found >= BODY.lower).all(),
         'upper limits': (found <= BODY.upper).all(),
-        # Near the straight limb angles follow from places only to the root of the rounding.
+        # Near a straight limb, angles are determined only to the square root of rounding errors.
         'image': off_rays(found, pose).max() < 1e-6,
     }
     return [name for name, ok in holds.items() if not ok]
@@ -82,7 +82,7 @@ def test_image_lengths_and_limits_hold_for_every_leaf(kind, pose):
 @settings(max_examples=20, deadline=None)
 @given(pose=poses(fixed={'left_elbow': 0.0}))
 def test_straight_elbow(pose):
-    """The twist of the upper arm is free: it stays, or has what the hand asks for."""
+    """The free twist of the upper arm is unchanged, or determined by the hand."""
     assert not faults_of(pose, enumerate_flips(BODY, pose, 'left_arm')[0])
 
 
@@ -93,7 +93,7 @@ def test_straight_elbow(pose):
     )
 )
 def test_straight_arm(pose):
-    """Elbow and hand in line: no joint says anything about the twist."""
+    """With elbow and hand in line, no joint determines the twist."""
     found, _ = enumerate_flips(BODY, pose, 'left_arm')
     assert not faults_of(pose, found)
     straight = np.abs(found[:, NAMES.index('left_elbow')]) < 1e-9
@@ -111,7 +111,7 @@ def test_gimbal(pose, sign):
 
 
 def test_gimbal_itself():
-    """The upper arm along the axis of its first angle exactly, with limits that let it there."""
+    """The upper arm lies exactly along the axis of its first angle, with limits that allow it."""
     pose = np.array(BODY.prior_mean)
     pose[2] = 3.0
     pose[NAMES.index('left_shoulder_y')] = np.pi / 2
@@ -150,7 +150,7 @@ def test_ray_that_misses():
 
 
 def test_joint_behind_the_camera():
-    """With the camera inside the sphere of a link one of its two places lies behind: no leaf."""
+    """If the camera is inside a link's sphere, one of two solutions is behind it: no leaf."""
     rng = np.random.default_rng(1)
     which = BODY.skeleton.joint_index(ARM)
     inside = 0

@@ -1,4 +1,4 @@
-"""Flips: what every leaf keeps, and how many there are, against recursion and symmetries."""
+"""Flips: invariants and number of leaves, compared with recursion and symmetries."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def small() -> Body:
 
 
 def without_limits(body: Body) -> Body:
-    """All joint angles may take all values."""
+    """The body without joint limits."""
     s = body.skeleton
     turns = s.dof_is_rotation
     lower, upper = np.where(turns, -np.pi, s.lower), np.where(turns, np.pi, s.upper)
@@ -41,7 +41,7 @@ def without_limits(body: Body) -> Body:
 
 
 def limb_places(body, poses, chain):
-    """Joints (N, n + 1, 3) of a limb from its start outwards."""
+    """Joints (N, n + 1, 3) of a limb, from its start outwards."""
     which = body.skeleton.joint_index(LIMBS[chain])
     return body.joint_positions(poses)[:, which]
 
@@ -53,7 +53,7 @@ def on_rays(points, seen):
 
 
 def leaves_by_recursion(start, seen, lengths):
-    """Joint places of all leaves: each joint where its ray meets the sphere around the last one."""
+    """Joint positions of all leaves, at intersections of rays with spheres around the parent."""
     if len(lengths) == 0:
         return [np.empty((0, 3))]
     ray = seen[0] / np.linalg.norm(seen[0])
@@ -75,7 +75,7 @@ def expected_leaves(body, pose, chain):
 
 
 def angle_solutions(angles, mount):
-    """All angles modulo 2 pi that put the joints of a limb to the same places, by symmetry.
+    """All angles modulo 2 pi with the same joint positions of a limb, by symmetry.
 
     Rx(a + pi) Ry(pi - b) Rz(c + pi) is the same rotation; Rz(c + pi) Rx(-e) differs by a half turn
     about z, which the end effector, mounted on the limb, undoes; its own second solution keeps the
@@ -158,7 +158,7 @@ def test_a_chain_of_n_links_without_limits_has_the_leaves_of_its_rays(
 
 
 def test_joints_behind_the_camera_are_pruned(small, random_poses):
-    """Where the camera is inside the sphere of a link, one of its two solutions lies behind."""
+    """If the camera is inside the sphere of a link, one of two solutions is behind it."""
     free = without_limits(small)
     poses = random_poses(small, 1000, 5)
     poses[:, 2] = 0.35
@@ -184,7 +184,7 @@ def test_limits_leave_the_leaves_that_some_angles_within_them_reach(body, random
     free, roots = enumerate_flips(without_limits(body), poses, chain)
     mount = body.skeleton.mounts[body.chains[chain][-1]]
     solutions = np.array([angle_solutions(pose[own], mount) for pose in free])
-    # All eight do put the joints there, and up to shifts by 2 pi no others.
+    # All eight give these joint positions, and no others do, up to shifts by 2 pi.
     everything = np.repeat(free, 8, axis=0)
     everything[:, own] = solutions.reshape(-1, 6)
     places = limb_places(body, everything, chain).reshape(len(free), 8, 4, 3)
@@ -224,7 +224,7 @@ def test_chains_multiply(body, random_poses):
     for chain in chains:
         before = limb_places(body, poses, chain)[parents]
         assert on_rays(limb_places(body, leaves, chain), before).max() < 1e-9
-    # Every leaf of a chain is there, each with all of the others.
+    # Every leaf of a chain is combined with all leaves of the others.
     own = body.skeleton.chain_dofs['left_arm']
     alone, roots = enumerate_flips(body, poses, 'left_arm')
     for p in range(8):
@@ -258,7 +258,7 @@ def test_every_lens_sees_the_flips_alike(small, random_poses):
 
 
 def test_straight_limbs_keep_their_free_angle(small):
-    """With a straight elbow the upper arm's twist is free: it stays."""
+    """With a straight elbow the upper arm's twist is free and does not change."""
     pose = small.prior_mean.copy()
     pose[2] = 3.0
     names = small.dof_names
@@ -268,14 +268,14 @@ def test_straight_limbs_keep_their_free_angle(small):
     pose[names.index('left_shoulder_x')] -= 0.45
     leaves, _ = enumerate_flips(small, pose, 'left_arm')
     places = limb_places(small, leaves, 'left_arm')
-    # Near the straight limb angles follow from places only to the root of the rounding.
+    # Near a straight limb, angles are determined only to the square root of rounding errors.
     assert on_rays(places, limb_places(small, pose[None], 'left_arm')).max() < 1e-7
     bend = places[:, 2] - 2 * places[:, 1] + places[:, 0]
     straight = np.abs(leaves[:, names.index('left_elbow')]) < 1e-9
     assert straight.sum() >= 1
     assert np.allclose(leaves[straight, twist], 0.4)
     assert np.linalg.norm(bend[straight], axis=1).max() < 0.06  # the lengths differ by 5.5 cm
-    # Solved again, and not only copied from the pose.
+    # The solution is computed, not copied from the pose.
     hung, _ = rehang_chain(small, pose[None], pose[None], 'left_arm', slack=1e-9)
     straight = np.abs(hung[:, names.index('left_elbow')]) < 1e-9
     assert straight.sum() >= 1
@@ -357,7 +357,7 @@ def test_a_limb_on_the_same_trunk_has_its_flips(small, random_poses):
 
 @pytest.mark.parametrize(('miss', 'found'), [(0.0, 1), (0.04, 1), (0.06, 0)])
 def test_rays_that_miss_by_less_than_the_slack_are_touched(small, miss, found):
-    """The neck is moved aside until the head's ray passes it at its length and a little more."""
+    """The neck is moved aside until the head's ray misses the sphere by a little."""
     pose = np.zeros(small.dimension)
     pose[2] = 3.0
     free = without_limits(small)
@@ -369,12 +369,12 @@ def test_rays_that_miss_by_less_than_the_slack_are_touched(small, miss, found):
     new = pose.copy()
     new[:3] += foot - neck + (length + miss) * aside
     hung, parents = rehang_chain(free, pose[None], new[None], 'neck', slack=0.05)
-    # Once: the ray touches the sphere, and both solutions are one.
+    # There is one solution, because the ray touches the sphere.
     assert len(hung) == len(parents) == found
     if found:
         moved_neck, moved_head = limb_places(free, hung[:1], 'neck')[0]
         assert np.allclose(moved_neck, foot + (length + miss) * aside, atol=1e-12)
-        # The nearest that the head comes to its ray: on the perpendicular, at its length.
+        # The head is as near to its ray as possible: on the perpendicular, at its length.
         assert np.allclose(moved_head, foot + miss * aside, atol=1e-7)
 
 

@@ -1,4 +1,4 @@
-"""Products of limbs: configurations against the flips one by one, the best against enumeration."""
+"""Products of limbs: configurations compared with single flips, the best with enumeration."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def body(request):
 
 
 def modes_of(body, count, seed, spread=0.15):
-    """Poses of one trunk (G, d) whose limbs differ."""
+    """Poses (G, d) with the same trunk and different limbs."""
     rng = np.random.default_rng(seed)
     lead = body.prior_mean + 0.3 * body.prior_sigma * rng.standard_normal(body.dimension)
     lead[:3] = [0.3, -0.2, 3.0]
@@ -46,7 +46,7 @@ def found_by_search(body, seed):
 
 
 def distinct_one_by_one(body, pose, chain, angles):
-    """Rows that are kept, and the row that stands for each of angles (A, D)."""
+    """Distinct rows, and the representative row of each of angles (A, D)."""
     poses = np.repeat(pose[None], len(angles), axis=0)
     poses[:, body.skeleton.chain_dofs[chain]] = angles
     joints = body.joint_positions(poses)[:, body.skeleton.chain_joints[chain]]
@@ -66,7 +66,7 @@ def distinct_one_by_one(body, pose, chain, angles):
 
 
 def configurations_one_by_one(body, modes, found):
-    """Trunks (T, d), and angles of each limb on each by its name; penalties on the first trunk."""
+    """Trunks (T, d), and by name the angles of each limb on each; penalties on the first trunk."""
     skeleton, lead = body.skeleton, modes[:1]
     dofs, paired = skeleton.chain_dofs, {x for pair in body.chain_pairs for x in pair}
     trunks, angles, penalties = [lead[0]], [{}], {}
@@ -79,7 +79,7 @@ def configurations_one_by_one(body, modes, found):
         poses = np.repeat(lead, len(sources), axis=0)
         poses[:, own] = sources
         flips, parents = enumerate_flips(body, poses, chain)
-        # Each is the first of its own flips.
+        # Each pose is the first of its own flips.
         every = flips[:, own]
         price = np.full((len(modes), len(every)), PRICE)
         for g in range(len(modes)):
@@ -148,7 +148,7 @@ def test_many_modes_leave_the_flips_of_the_best_among_few_configurations(body):
 
 
 def test_limbs_change_places_and_the_torso_flips_somewhere(body):
-    """Else the comparison above says nothing."""
+    """Otherwise the comparison above is meaningless."""
     found = [
         LimbProducts.of(body, modes_of(body, 1, seed), {}, PRICE, apart=APART, most=MOST)
         for seed in range(8)
@@ -188,7 +188,7 @@ def test_poses_alone(body):
 
 
 def made_up(body, group, trunks, seed, *, ties=False):
-    """Products of made-up configurations, and energies of the poses alone."""
+    """Products of random configurations, and energies of the poses alone."""
     rng = np.random.default_rng(seed)
     limbs = limbs_of(body.skeleton)
     counts = rng.integers(1, 4, (trunks, len(limbs.links)))
@@ -209,7 +209,7 @@ def made_up(body, group, trunks, seed, *, ties=False):
 
 
 def enumerated(products, energies, log_weights, exchange, flip, share):
-    """All products, trunk after trunk, the best first: costs, parents, energies, poses."""
+    """All products, best first: costs, parents, energies, poses."""
     found, body = products.configurations, products.body
     limbs, rows = limbs_of(body.skeleton), iter(energies)
     bases, changes = [], []
@@ -257,7 +257,7 @@ def test_the_best_against_enumeration(body, group, trunks, count):
 
 @pytest.mark.parametrize('count', [1, 5, 40])
 def test_equal_sums(body, count):
-    """Costs are whole numbers, so that sums are exact and often equal: all are of the best."""
+    """Costs are integers, so sums are exact and often equal; all results are among the best."""
     products, energies, log_weights = made_up(body, 2, 3, 11, ties=True)
     log_weights = np.zeros_like(log_weights)
     found = products.best(energies, log_weights, exchange=0.0, flip=0.0, share=1.0, count=count)

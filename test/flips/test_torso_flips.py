@@ -1,4 +1,4 @@
-"""Flips of the torso: lines mirrored at rays, lengths and images by plain geometry."""
+"""Flips of the torso: lines mirrored at rays; lengths and images by plain geometry."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.flips.torso_flips import flip_torso
 
 TORSO = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
-# hips turned, trunk leaned the other way, shoulders turned
+# whether hips turn, the trunk leans the other way, shoulders turn
 FLIPS = list(itertools.product((False, True), repeat=3))[1:]
 
 
@@ -24,7 +24,7 @@ def body(request) -> Body:
 
 @pytest.fixture(scope='module')
 def twisting() -> Body:
-    """The body whose trunk can do everything that a flip asks for."""
+    """A body whose trunk has all motions needed by a flip."""
     return load_body('human37')
 
 
@@ -56,13 +56,13 @@ def mirrored_in_depth(line, at):
 
 
 def starts_of(body, pose):
-    """Where the trunk of a pose (d,) starts, (3,)."""
+    """Start (3,) of the trunk of a pose (d,)."""
     trunk = body.skeleton.segment_names.index('trunk')
     return forward(body.skeleton, pose[None]).origins[trunk, :, 0]
 
 
 def complete(body, count=60, seed=0):
-    """Poses that have all seven flips, and these (N, 7, d)."""
+    """Poses with all seven flips, and the flips (N, 7, d)."""
     poses = turned_people(body, count, seed)
     flips, parents = flip_torso(body, poses)
     all_seven = np.flatnonzero(np.bincount(parents, minlength=count) == 7)
@@ -83,7 +83,7 @@ def test_all_choices_on_a_body_that_twists(twisting):
         if hips:
             wanted = mirrored_in_depth(wanted, pelvis)
         assert np.allclose(new[3] - new[2], wanted, atol=1e-9)
-        # The neck is where its ray meets the trunk's sphere, on the one side or on the other.
+        # The neck is at one of the two intersections of its ray with the trunk's sphere.
         ray = neck / np.linalg.norm(neck)
         assert np.linalg.norm(np.cross(new[1], ray)) < 1e-9
         start, moved = starts_of(twisting, poses[n]), starts_of(twisting, flips[n, i])
@@ -92,7 +92,7 @@ def test_all_choices_on_a_body_that_twists(twisting):
         if not hips:
             nearest = (ray @ start) * ray
             assert np.allclose(new[1], 2 * nearest - neck if lean else neck, atol=1e-9)
-        # The shoulders turn to the wanted line as far as the trunk's direction lets them.
+        # The shoulders turn to the wanted line as far as the trunk's direction allows.
         wanted = right_shoulder - left_shoulder
         if shoulders:
             wanted = mirrored_in_depth(wanted, neck)
@@ -118,12 +118,12 @@ def test_lengths_and_other_degrees_of_freedom_stay(body):
 
 
 def test_the_torso_moves_in_depth_and_hardly_in_the_image(body):
-    """Mirrored lines are foreshortened alike; the neck is on its ray."""
+    """Mirrored lines have the same foreshortening; the neck is on its ray."""
     poses = turned_people(body, 40, 2)
     poses[:, 2] += 5.0
     flips, parents = flip_torso(body, poses)
     before, after = torso_of(body, poses)[:, parents], torso_of(body, flips)
-    if body.name != 'human34':  # whose shoulders turn with the trunk alone
+    if body.name != 'human34':  # its shoulders turn only with the trunk
         shift = np.abs(after[..., 2] - before[..., 2]).max(0)
         assert shift.min() > 0.03
     hips, shoulders = slice(2, 4), slice(4, 6)
@@ -134,7 +134,7 @@ def test_the_torso_moves_in_depth_and_hardly_in_the_image(body):
     image_of_neck = (x[1, :, :2] / x[1, :, 2:] for x in (before, after))
     gap = np.linalg.norm(np.subtract(*image_of_neck), axis=1)
     if body.name != 'human32':
-        # The trunk does not start at the pelvis: where that turns, the ray may be missed.
+        # The trunk does not start at the pelvis, whose rotation can make it miss the ray.
         assert np.median(gap) < 1e-9
         assert gap.max() < 2e-3
 
@@ -161,13 +161,13 @@ def test_a_rigid_torso_turns_only():
     for n in range(20):
         wanted = mirrored_in_depth(before[3, n] - before[2, n], before[0, n])
         assert np.allclose(after[3, n] - after[2, n], wanted, atol=1e-9)
-    # Pairwise distances of a rigid torso stay.
+    # Pairwise distances of a rigid torso are constant.
     gaps = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
     assert np.allclose(*gaps, atol=1e-12)
 
 
 def test_flipping_back_gives_the_torso_again(twisting):
-    """Mirroring twice is nothing: for the line of the hips, and for the neck before its ray."""
+    """Mirroring twice is the identity, for the line of the hips and for the neck."""
     poses, flips = complete(twisting, seed=5)
 
     def lines(poses):
@@ -184,7 +184,7 @@ def test_flipping_back_gives_the_torso_again(twisting):
 
 
 def test_a_torso_across_the_line_of_sight_has_no_flips(twisting):
-    """Far away rays are parallel: nothing upright and frontal is behind anything."""
+    """At a large distance rays are parallel, and an upright frontal torso has no depth."""
     pose = np.zeros(twisting.dimension)
     pose[1:3] = 0.215, 20.0
     assert len(flip_torso(twisting, pose)[0]) == 0

@@ -1,4 +1,4 @@
-"""A rendered person, seen twice, that the tests of the image share."""
+"""Two images of a rendered person, which the tests of `image` share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Drawn scenes of straight lines, in a level frame: x to the right, y down, z forward."""
+"""Drawings of scenes of straight lines, in a level frame: x to the right, y down, z forward."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROOM = (
 
 
 def turn(pitch: float, roll: float) -> np.ndarray:
-    """From a level frame (y down, z forward) to a camera that looks down and is rolled, rad."""
+    """Rotation from the level frame to a camera that looks down and is rolled, angles in rad."""
     c, s = np.cos(pitch), np.sin(pitch)
     down = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
     c, s = np.cos(roll), np.sin(roll)

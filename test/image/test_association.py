@@ -1,4 +1,4 @@
-"""Who is who from image to image."""
+"""Association of people from image to image."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def sighting(column, row=100.0, shape=SHAPE, seen=4):
 
 
 def walked(start, speed, images=5, **shape):
-    """A track of somebody who walks at a speed in px an image."""
+    """The track of a person who walks at a speed in px per image."""
     track = ImageTrack(sighting(start, **shape), 0)
     for i in range(1, images):
         track.update(sighting(start + i * speed, **shape), i * FRAME)
@@ -34,7 +34,7 @@ def walked(start, speed, images=5, **shape):
 
 
 def test_two_people_who_cross_keep_their_tracks():
-    """In the image of the crossing both are where the other was."""
+    """In the image of the crossing each is where the other was."""
     right, left = walked(60.0, 10.0), walked(140.0, -10.0)
     for i in range(5, 12):
         places = [60.0 + 10.0 * i, 140.0 - 10.0 * i]
@@ -50,7 +50,7 @@ def test_the_cost_is_the_median_way_in_sizes():
     track = walked(0.0, 0.0)
     size = np.hypot(30.0, 50.0)
     assert track.cost(sighting(6.0), 5 * FRAME) == pytest.approx(6.0 / size)
-    # Where no joint is in common the middles of the boxes tell.
+    # Without a common joint, the centres of the boxes are compared.
     assert track.cost(sighting(6.0, seen=0), 5 * FRAME) == pytest.approx(6.0 / size)
 
 

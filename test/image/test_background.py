@@ -1,4 +1,4 @@
-"""Silhouettes by background subtraction, on made-up scenes and on a rendered person."""
+"""Silhouettes by background subtraction, for synthetic scenes and a rendered person."""
 
 import cv2
 import numpy as np
@@ -55,7 +55,7 @@ def test_shadow_is_no_foreground(scene, method):
 
 def test_what_is_found_does_not_depend_on_images_before():
     scene = np.full((60, 80, 3), 100, np.uint8)
-    # So far from the background is just foreground: any drift of its variance decides otherwise.
+    # A difference just above the threshold, which any drift of the variance would change.
     image = scene + 10
     background = model(scene, 'mog2')
     assert background.foreground(image).all()
@@ -123,7 +123,7 @@ def test_an_image_of_another_size_is_refused_and_changes_nothing(scene, method):
 
 @pytest.mark.parametrize('method', METHODS)
 def test_a_background_with_a_person_in_it_is_put_together_anew(scene, method):
-    """The person stood at the left while it was learned, and walks to the right."""
+    """The person stood at the left during learning, and walks to the right."""
     background = BackgroundModel(BackgroundSettings(method=method))
 
     def shown(left, seed):
@@ -145,7 +145,7 @@ def test_a_background_with_a_person_in_it_is_put_together_anew(scene, method):
     assert not background.foreground(image).any()
     for i in range(10):
         background.complete(*shown(40, 20 + i))
-    # What is unknown is where the person stood all the time, and no foreground.
+    # Only the area always covered by the person is unknown, and it is not foreground.
     assert np.array_equal(background.unknown, person)
     assert not background.silhouette(image).any()
     image[5:20, 100:130] = (10, 240, 30)
@@ -201,7 +201,7 @@ def test_edges_of_the_background_that_move_by_a_pixel_are_no_foreground():
 
 @pytest.fixture(scope='module', params=[(480, 640), (481, 643), (720, 1280), (1080, 1920)], ids=str)
 def large(request):
-    """A large empty scene, somebody in it (an ellipse), where, and the shorter half axis."""
+    """A large empty scene, an elliptical person in it, the mask, and the shorter half axis."""
     height, width = request.param
     rng = np.random.default_rng(3)
     coarse = rng.integers(60, 200, (24, 32, 3)).astype(np.uint8)
@@ -221,7 +221,7 @@ def test_large_images_are_made_smaller_and_the_outline_is_smooth(large, method):
     assert background.empty.shape[0] < 400
     found, unsure = background.split(image)
     assert found.shape == unsure.shape == wanted.shape
-    # The outline lies within a pixel of the smaller image from the true one.
+    # The outline is within one pixel of the reduced image from the true one.
     around = np.ones((3, 3), np.uint8)
     step = round(len(image) / 240)
     within = cv2.dilate(wanted.astype(np.uint8), around, iterations=step)

@@ -1,4 +1,4 @@
-"""The term of the depth against numpy, finite differences, and scenes of known depth."""
+"""The depth term, compared with numpy, finite differences, and scenes of known depth."""
 
 from dataclasses import replace
 from itertools import product
@@ -23,13 +23,13 @@ ALONE = LikelihoodSettings.of_terms(depth=DEPTH.settings)
 
 @pytest.fixture(scope='module')
 def true_depth(shot):
-    """What a perfect sensor sees at the second pose; inf: nothing."""
+    """Depth from a perfect sensor at the second pose; inf if nothing is there."""
     return render(shot.body, shot.poses[1], shot.camera, Scene(seed=2)).depth
 
 
 @pytest.fixture(scope='module')
 def sensed(shot, true_depth):
-    """What a sensor sees before a wall at 5 m, m."""
+    """Depth from a sensor, with a wall at 5 m, m."""
     return 1e-3 * sensed_depth(np.minimum(true_depth, 5.0), shot.camera, seed=4)
 
 
@@ -46,7 +46,7 @@ def seen(shot, depth, **more):
 
 
 def front_points(body, pose):
-    """(segment, part, place in the segment, normal there) of the points towards the camera."""
+    """(segment, part, local position, local normal) of the points that face the camera."""
     frames = forward(body.skeleton, pose[None])
     rings, parts = body.flesh.rings, body.flesh.ring_parts
     noise = flesh_table_of(body).ring_noise
@@ -69,7 +69,7 @@ def front_points(body, pose):
 
 
 def is_hidden(body, frames, part, point):
-    """Whether the ellipsoid of another part lies before a point (3,)."""
+    """Whether the ellipsoid of another part is in front of a point (3,)."""
     for b, other in enumerate(body.flesh.parts):
         if b == part:
             continue
@@ -84,7 +84,7 @@ def is_hidden(body, frames, part, point):
 
 
 def measured_at(depth, u, v):
-    """Depth at a pixel, bilinear on a surface, nearest at its ends; 0: nothing was measured."""
+    """Depth at a pixel, bilinear on a surface, nearest at its ends; 0 if not measured."""
     height, width = depth.shape
     if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
         return 0.0
@@ -96,9 +96,9 @@ def measured_at(depth, u, v):
 
 
 def oracle_energy(body, camera, settings, depth, pose, held=None, factors=None):
-    """The energy of a pose; held: points of another pose, which stay where they are on the skin.
+    """The energy of a pose; `held` are points of another pose, fixed on the skin.
 
-    `factors` (S,) are those of the segments; None: 1.
+    `factors` (S,) are the factors of the segments; None means 1.
     """
     points = oracle_points(body, camera, settings, depth, pose) if held is None else held
     frames = forward(body.skeleton, pose[None])
@@ -113,7 +113,7 @@ def oracle_energy(body, camera, settings, depth, pose, held=None, factors=None):
 
 
 def oracle_points(body, camera, settings, depth, pose):
-    """(segment, place in it, deviation of its residual) of the visible points of a pose."""
+    """(segment, local position, residual deviation) of the visible points of a pose."""
     frames = forward(body.skeleton, pose[None])
     points = []
     for segment, part, place, normal, deviation in front_points(body, pose):
@@ -134,7 +134,7 @@ def test_the_kernel_equals_numpy(shot, sensed, distortion):
     likelihood = ImageLikelihood(shot.body, camera, ALONE)
     poses = np.concatenate([shot.near(5, 1), shot.near(3, 2, spread=0.5)])
     found = image_energy(likelihood, poses, seen(shot, sensed)).value
-    # Beyond the window that evidence is taken from nothing is known.
+    # Outside the evaluated window nothing is known.
     whole = observe(shot.images[1], depth=sensed)
     found = image_energy(likelihood, poses, whole).value
     depth = usable_depths(sensed)
@@ -144,7 +144,7 @@ def test_the_kernel_equals_numpy(shot, sensed, distortion):
 
 
 def with_factors(shot, sensed):
-    """Depths in which each segment is believed by a factor of its own, and these factors."""
+    """Depths with a reliability factor for each segment, and these factors."""
     factors = np.random.default_rng(3).uniform(0.0, 2.0, len(shot.body.skeleton.parents))
     beliefs = Beliefs(1.0, np.ones(3), 1.0, {'depth': factors})
     return replace(observe(shot.images[1], depth=sensed), beliefs=beliefs), factors
@@ -152,7 +152,7 @@ def with_factors(shot, sensed):
 
 def test_the_kernel_equals_numpy_where_segments_have_factors(shot, sensed, likelihood):
     poses = shot.near(4, 1)
-    # Without a measurement a point has a cost as well.
+    # Points without a measurement have a cost, too.
     for given in (sensed, 0.0 * sensed + 2.0 * (np.arange(sensed.shape[1]) < 160)):
         observation, factors = with_factors(shot, given)
         depth = usable_depths(given)
@@ -165,7 +165,7 @@ def test_the_kernel_equals_numpy_where_segments_have_factors(shot, sensed, likel
 
 @pytest.mark.parametrize('weighed', [False, True], ids=['usual', 'factors'])
 def test_gradient_at_material_points(shot, sensed, likelihood, weighed):
-    """The gradient is that of points which stay on the skin, with their deviations."""
+    """The gradient is that of points fixed on the skin, with fixed deviations."""
     poses, step = shot.near(2, 7), 1e-6
     depth = usable_depths(sensed)
     observation, factors = observe(shot.images[1], depth=sensed), None
@@ -191,11 +191,11 @@ def test_the_hessian_is_positive_semidefinite(shot, sensed, likelihood):
     assert np.linalg.eigvalsh(found).min() > -1e-8 * np.abs(found).max()
 
 
-# What it says.
+# Information of the term.
 
 
 def test_the_noise_grows_with_the_square_of_the_distance(shot, true_depth):
-    """An error of 5 % costs less far away, and without growth what the flesh alone allows."""
+    """An error of 5 % costs less far away; without growth only the flesh's noise counts."""
     costs = []
     for growth in (0.0, 0.002, 0.02):
         settings = replace(ALONE, depth=replace(DEPTH.settings, growth=growth))
@@ -210,7 +210,7 @@ def test_the_noise_grows_with_the_square_of_the_distance(shot, true_depth):
 
 @pytest.mark.parametrize('other', [0.4, 9.0], ids=['occluder', 'background'])
 def test_other_surfaces_cost_at_most_what_the_kernel_allows(shot, sensed, likelihood, other):
-    """A pose that is hidden, or before an empty place, is not pulled there."""
+    """A hidden pose, or one in front of an empty scene, is not pulled to other surfaces."""
     depth = np.full_like(sensed, other)
     found = image_energy(likelihood, shot.poses[1:], seen(shot, depth))
     most = 0.5 * DEPTH.settings.weight * DEPTH.settings.scale**2
@@ -222,7 +222,7 @@ def test_other_surfaces_cost_at_most_what_the_kernel_allows(shot, sensed, likeli
 
 
 def test_depth_tells_which_way_a_forearm_points(shot, true_depth, likelihood):
-    """A forearm towards the camera and away from it look alike, but not to a depth camera."""
+    """Forearms towards and away from the camera look the same, but their depths differ."""
     body, camera = shot.body, shot.camera
     pose = np.clip(np.zeros(body.dimension), body.lower, body.upper)
     pose[:3] = [0.0, 0.0, 3.0]
@@ -237,7 +237,7 @@ def test_depth_tells_which_way_a_forearm_points(shot, true_depth, likelihood):
 
 
 def test_depth_of_somebody_else_says_nothing(shot, sensed):
-    """Where others cover the person, their depth is not that of the person."""
+    """Depth of people who occlude the person is not the person's."""
     others = np.zeros(shot.masks[1].shape, dtype=bool)
     others[:, 100:180] = True
     nearer = np.where(others, 0.5 * sensed, sensed)

@@ -1,4 +1,4 @@
-"""An empty scene is known once it was seen without anybody, and a ghost gives itself away."""
+"""The empty scene is learned from images without people, and ghosts in it are recognised."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
 
 @pytest.fixture(scope='module')
 def crossing(human32):
-    """Images of a person who stands, and then walks aside, and the empty scene."""
+    """Images of a person who stands and then walks aside, and the empty scene."""
     view = Viewpoint(distance=4.5)
     pose = procedural_motion('reach', human32, 0.1, 10.0, 3, viewpoint=view)[0]
     poses = np.tile(pose, (20, 1))
@@ -37,7 +37,7 @@ def noisy(image, seed):
 
 
 def seen_for(image, seconds, rate, scene=None, start=0):
-    """The scene after a time in which nothing moved; at a number of images a second."""
+    """The scene after `seconds` without motion, at `rate` images a second."""
     scene = scene or EmptyScene(BackgroundModel())
     for i in range(round(seconds * rate) + 1):
         scene.learn(noisy(image, i), start + round(i * SECOND / rate))
@@ -60,7 +60,7 @@ def test_a_scene_in_which_somebody_moves_is_not_empty(crossing):
         scene.learn(noisy(image, i), i * SECOND // 10)
         assert not scene.known
     assert scene.wants == UNSEEN
-    # Who has left is not in what is learned from then on.
+    # A person who has left is not in the scene learned from then on.
     scene = seen_for(empty, 2.0, 10.0, scene, start=10 * SECOND)
     assert scene.known
     assert scene.wants == ''
@@ -79,7 +79,7 @@ def test_a_detector_counts(crossing):
 
 
 def test_a_ghost_gives_itself_away(crossing):
-    """Somebody who kept still while the scene was learned, and then goes, leaves one."""
+    """A person who kept still while the scene was learned leaves a ghost on walking away."""
     images, empty = crossing
     ghost, true = seen_for(images[0], 3.0, 10.0), seen_for(empty, 3.0, 10.0)
     assert ghost.known
@@ -87,7 +87,7 @@ def test_a_ghost_gives_itself_away(crossing):
         for scene in (ghost, true):
             scene.judge(image, 4 * SECOND + i * SECOND // 10)
         if i == 0:
-            # Nothing is made of the first silhouette.
+            # The first silhouette has no effect.
             assert not ghost.known
         assert true.known
     assert ghost.is_of_somebody

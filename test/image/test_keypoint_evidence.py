@@ -1,4 +1,4 @@
-"""What keypoints say of somebody's presence."""
+"""The evidence of keypoints for the presence of a person."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_evidence(seen, wanted, human32):
 @pytest.mark.parametrize(('metre', 'wanted'), [(100.0, 1.0), (33.0, 0.5), (15.0, 0.0)])
 @pytest.mark.parametrize('part', ['', 'shoulder elbow wrist'])
 def test_a_small_person_is_a_mistake(human32, metre, wanted, part):
-    """Wherever it is, and whether a part of it is seen; it is no empty image, either."""
+    """At any place, seen whole or in part; it is not evidence of an empty image, either."""
     joints = human32.joint_positions(human32.prior_mean[None])[0]
     rows = [i for i, x in enumerate(human32.joint_names) if any(y in x for y in part.split(' '))]
     seen = Keypoints(

@@ -30,7 +30,7 @@ def pose():
 
 
 def seen(pose, *, lifted=True, noise=0.0, rng=None):
-    """What a detector of MediaPipe's landmarks would say of a pose."""
+    """Keypoints of a detector with MediaPipe's landmarks for a pose."""
     scheme = schemes()['mediapipe33']
     n = len(scheme.names)
     unknown = Keypoints(
@@ -52,7 +52,7 @@ def seen(pose, *, lifted=True, noise=0.0, rng=None):
 
 
 def exchanged(keypoints, words):
-    """The keypoints of limbs whose names have one of some words, with left for right."""
+    """The keypoints with left and right swapped for names that contain one of some words."""
     names = tuple(
         other_side(name) if any(word in name for word in words) else name
         for name in keypoints.names
@@ -112,12 +112,12 @@ def test_an_exchange_costs_its_prior_and_no_more(pose):
     cost = energy(term(exchanged(plain, words)), pose).value - energy(term(plain), pose).value
     usual = usual_exchanges()[0]
     assert cost == pytest.approx(usual[NONE] - usual[ALL], abs=1.0)
-    # Believed, they would cost more than any prior.
+    # Without an exchange they would cost more than any prior.
     assert energy(term(exchanged(plain, words), exchanges=False), pose).value > 50.0
 
 
 def test_lifted_poses_tell_towards_from_away(pose):
-    """A forearm that points away instead of towards the camera looks the same without them."""
+    """Without them, forearms towards and away from the camera look the same."""
     elbow = BODY.dof_names.index('right_elbow')
     other = pose.copy()
     other[elbow] += 0.6
@@ -132,6 +132,6 @@ def test_residuals_have_the_derivatives_of_the_energy(pose):
     frames = forward(BODY.skeleton, pose[None])
     joints, _, directions, pull, curvature = one.residuals(frames)
     assert len(joints) == 2 * len(one.keypoints.names)
-    # A translation of the whole person moves all landmarks alike.
+    # A translation of the person moves all landmarks equally.
     np.testing.assert_allclose(directions.T @ pull, energy(one, pose).gradient[0, :3])
     assert (curvature > 0).all()

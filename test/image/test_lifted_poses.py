@@ -22,7 +22,7 @@ JOINTS = (
 )  # fmt: skip
 BODY = load_body('human37')
 CAMERA = Camera(500.0, 500.0, 320.0, 240.0, 640, 480)
-# Fits the term whose weight is that of the mixture.
+# Step of finite differences.
 STEP = 1e-6
 
 
@@ -44,7 +44,7 @@ def lifted(seed=1, components=3):
 
 
 def term(poses, exchanges):
-    """Of one keypoint that hardly counts, and of the mixture."""
+    """A term with one keypoint of little weight, and the mixture."""
     pixels = CAMERA.project(BODY.joint_positions(pose()[None])[0][:1])
     one = Keypoints(BODY.joint_names[:1], pixels, 1e12 * np.eye(2)[None], np.ones(1), lifted=poses)
     return KeypointTerm(BODY.skeleton, CAMERA, one, exchanges=exchanges)
@@ -59,7 +59,7 @@ def energies(poses: LiftedPoses, x: np.ndarray, exchanges: np.ndarray | None):
 
 
 def density(poses, x):
-    """Minus the log density of depths, as the formula of the page says it."""
+    """Minus the log density of depths, by the formula on the page."""
     joints = BODY.joint_positions(x[None])[0]
     hips = joints[BODY.skeleton.joint_index(HIPS)].mean(0)
     depth = (joints[BODY.skeleton.joint_index(poses.joints)] - hips) @ poses.axes[2]
@@ -71,7 +71,7 @@ def density(poses, x):
 
 def test_energy_is_the_log_density_of_depths():
     poses = lifted()
-    # What the term adds beside the mixture does not depend on the pose.
+    # Other parts of the term do not depend on the pose.
     found = [energy(poses, pose(i), NOT_EXCHANGED) for i in range(4)]
     wanted = [LIFTED_WEIGHT * density(poses, pose(i)) for i in range(4)]
     assert np.ptp(np.array(found) - wanted) < 1e-8

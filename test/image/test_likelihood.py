@@ -1,4 +1,4 @@
-"""The compiled likelihood against vectorised numpy, finite differences and ray marching."""
+"""The compiled likelihood, compared with numpy, finite differences and ray marching."""
 
 from dataclasses import replace
 
@@ -46,7 +46,7 @@ def observation(shot):
 
 
 def believed(shot, observation):
-    """The observation, of whose cues each segment has a factor of its own; some are 0."""
+    """The observation with a factor on its cues for each segment; some factors are 0."""
     rng = np.random.default_rng(12)
     count = len(shot.body.skeleton.parents)
     segments = {
@@ -65,14 +65,14 @@ def only(likelihood, *names):
 
 
 def relative_difference(found, wanted):
-    """The largest, relative to the largest entry of each pose."""
+    """The largest difference, relative to the largest entry of each pose."""
     axes = tuple(range(1, found.ndim))
     scale = np.abs(wanted).max(axis=axes, keepdims=True) if axes else np.abs(wanted)
     return (np.abs(found - wanted) / (scale + 1e-12)).max()
 
 
 def largest_difference(body, camera, poses, observation):
-    """Of the compiled terms to numpy, relative to the largest entry of each pose."""
+    """Largest relative difference between the compiled terms and numpy over poses."""
     likelihood = ImageLikelihood(body, camera)
     wanted = oracle.image_energies(likelihood, poses, observation)
     assert tuple(wanted) == IMAGE_TERMS
@@ -102,7 +102,7 @@ def test_kernels_equal_numpy(shot, observation, lens):
 
 
 def test_kernels_equal_numpy_far_from_the_truth(shot, observation):
-    """Also where limbs leave the image or come behind the camera."""
+    """Also if limbs leave the image or are behind the camera."""
     poses = shot.near(24, 2, spread=0.5)
     poses[:6, 2] -= 3.0
     poses[6:9, 2] = -1.0
@@ -194,7 +194,7 @@ def relative_errors(found, wanted):
 @pytest.mark.parametrize('factors', [False, True], ids=['usual', 'factors'])
 @pytest.mark.parametrize('name', IMAGE_TERMS)
 def test_gradients_of_contour_terms_at_material_points(shot, observation, name, factors):
-    """The gradient is that of points which stay where they are on the skin."""
+    """The gradient is that of points fixed on the skin."""
     body, camera = shot.body, shot.camera
     likelihood = only(ImageLikelihood(body, camera), name)
     poses = shot.near(6, 7)
@@ -239,7 +239,7 @@ def test_gradient_and_hessian_of_the_soft_prior(shot):
 
 
 def residuals(likelihood, frames, observation):
-    """Those of one pose, (M, 9)."""
+    """Residuals (M, 9) of one pose."""
     (found,) = likelihood.recorded(frames, observation)
     return found[1 : 1 + int(found[0, 0])]
 

@@ -1,4 +1,4 @@
-"""What is computed from an image, against brute force and by construction."""
+"""Maps computed from an image, against brute force and known answers."""
 
 import numpy as np
 import pytest
@@ -78,7 +78,7 @@ def test_edges_stand_in_the_bin_of_their_normal(quarter):
     own = whole(edges, quarter)[interior]
     across = whole(edges, (quarter + 2) % ORIENTATIONS)[interior]
     assert np.abs(own - np.abs(signed[interior])).max() < 3.0
-    # No edge of the direction across: nothing is near.
+    # There is no edge in the perpendicular direction.
     assert across.min() >= 100
 
 

@@ -58,7 +58,7 @@ def test_the_flow_is_the_shift_between_the_images():
 @pytest.mark.parametrize('lens', LENSES)
 @pytest.mark.parametrize('spread', [0.05, 0.5])
 def test_energies_equal_numpy(shot, flow, before, lens, spread):
-    """Also where limbs leave the image or come behind the camera."""
+    """This holds also where limbs leave the image or are behind the camera."""
     c = shot.camera
     camera = Camera(c.fx, c.fy, c.cx, c.cy, c.width, c.height, *LENSES[lens])
     term = term_of(shot, camera, flow, before)
@@ -89,7 +89,7 @@ def test_the_gradient_is_that_of_the_energy(shot, flow, before):
 
 
 def test_where_the_points_went_costs_nothing(shot, before):
-    """The flow that a pose makes itself; a pose that did not move pays for all of it."""
+    """The flow of the pose's own motion costs nothing; a pose that did not move pays for all."""
     pose = before[:1]
     moved = pose.copy()
     moved[0, 0] += 0.05

@@ -1,4 +1,4 @@
-"""What others cover speaks neither for a pose nor against it."""
+"""Pixels covered by other people count neither for a pose nor against it."""
 
 import cv2
 import numpy as np
@@ -40,7 +40,7 @@ def seen(human32, camera, pose):
 
 
 def energies(human32, camera, poses, image, mask, others):
-    """By name of the term."""
+    """Energies by the name of the term."""
     silhouette = mask if others is None else mask & ~others
     observation = observe(image, silhouette, others=others)
     alone = {x.name: LikelihoodSettings.of_terms(**{x.name: x.settings}) for x in TERMS}
@@ -51,7 +51,7 @@ def energies(human32, camera, poses, image, mask, others):
 
 
 def test_nothing_changes_where_others_change(human32, camera, pose, seen):
-    """Any picture in the unknown half gives the same energies."""
+    """Any content of the unknown half gives the same energies."""
     image, mask, others = seen
     poses = np.tile(pose, (3, 1))
     poses[1, 0] += 0.1
@@ -59,7 +59,7 @@ def test_nothing_changes_where_others_change(human32, camera, pose, seen):
     found = []
     for fill in (0, 255):
         other = image.copy()
-        # Blurs and edges reach a little over the border of what is unknown.
+        # Blurs and edges reach slightly beyond the border of the unknown region.
         inner = cv2.erode(others.astype(np.uint8), np.ones((41, 41), np.uint8)) > 0
         other[inner] = fill
         found.append(energies(human32, camera, poses, other, mask, others)['edges'])
@@ -72,7 +72,7 @@ def test_half_a_silhouette_does_not_punish_the_other_half(human32, camera, pose,
     known = energies(human32, camera, pose[None], image, mask & ~others, None)
     unknown = energies(human32, camera, pose[None], image, mask, others)
     whole = energies(human32, camera, pose[None], image, mask, None)
-    # The cut through the person is no outline.
+    # The border through the person is not an outline.
     assert unknown['coverage'] - whole['coverage'] < 0.2 * (known['coverage'] - whole['coverage'])
 
 
@@ -83,7 +83,7 @@ def test_a_silhouette_without_others(human32, camera, pose, seen):
     whole, part = model.split(image).foreground, model.split(image, None, others).foreground
     assert (whole & ~others).sum() > 0.9 * part.sum() > 0
     assert not part[others].any()
-    # The same image again costs no subtraction, another one does.
+    # The same image again needs no subtraction; another one does.
     changed = model.changed
     model.split(empty)
     assert model.changed < changed

@@ -1,4 +1,4 @@
-"""Colours of a person: shares, surroundings, and where an image shows them."""
+"""Colours of a person: shares, surroundings, and where they are in an image."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hmt_ros.image.person_colours import Colours
 
 
 def scene(left, colour=(40, 40, 200)):
-    """Somebody in red before a green wall, 20 px wide, from a column on, and where."""
+    """A person in red, 20 px wide from a column on, before a green wall, and the mask."""
     image = np.full((120, 160, 3), (60, 160, 60), dtype=np.uint8)
     model = np.zeros((120, 160), dtype=np.bool_)
     if left is not None:
@@ -19,7 +19,7 @@ def scene(left, colour=(40, 40, 200)):
 
 
 def textured(left):
-    """The same person before a wall in stripes."""
+    """The same person before a striped wall."""
     image, model = scene(left)
     image[:, ::8][~model[:, ::8]] = 120, 60, 20
     return image, model

@@ -1,4 +1,4 @@
-"""What a person covers, and which pieces of a silhouette have the shape of one."""
+"""The area a person covers, and which pieces of a silhouette have the shape of a person."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def camera() -> Camera:
 
 @pytest.fixture(scope='module')
 def film(camera, human32):
-    """Poses and silhouettes of a second."""
+    """Poses and silhouettes of one second."""
     view = Viewpoint(distance=3.2)
     poses = procedural_motion('reach', human32, 1.0, 10.0, 3, viewpoint=view)
     return poses, render_silhouettes(human32, poses, camera)
@@ -54,7 +54,7 @@ def test_shapes_of_persons(film):
 
 
 def test_the_largest_piece_is_that_of_a_person(film):
-    """A larger box beside the person is none, whatever is near it."""
+    """A larger box beside the person is not taken for the person, whatever is near it."""
     mask = film[1][0].copy()
     piece = largest_person(mask)
     assert piece.area == pytest.approx(mask.sum(), rel=0.02)

@@ -1,4 +1,4 @@
-"""Energies and minima that are compiled as a whole, against the sum of terms one by one."""
+"""Compiled energies and minima, compared with the sum of single terms."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def body():
 
 @pytest.fixture(scope='module')
 def seen(body):
-    """An image of somebody who waves, with keypoints, and the pose."""
+    """An image of a waving person with keypoints, and the pose."""
     view = Viewpoint(distance=3.4)
     pose = procedural_motion('dance', body, 0.5, 10.0, 3, viewpoint=view)[4]
     (frame,) = render_frames(body, pose[None], CAMERA, Scene(viewpoint=view, seed=4))
@@ -166,7 +166,7 @@ def test_energies_over_some_variables(terms, poses, body, motion):
     expected = motion_of(poses, motion, len(free))
     own = PoseEnergy(likelihood, some, expected, poses[0], free)
     reference = plain(likelihood, some, expected, poses[0], free)
-    # In the order in which the tracker gives them, which the compiled code is made for.
+    # In the order used by the tracker, for which the code is compiled.
     x, rows = np.ascontiguousarray(poses[:, free]), np.arange(COUNT)
     check_same(own.energy(x, rows), reference.energy(x, rows))
     found = own.minimise(x, max_iterations=6, **SOLVER)
@@ -189,7 +189,7 @@ def test_minima_are_those_of_the_solver_step_by_step(terms, poses, body, name, i
         reference, poses, body.lower, body.upper, max_iterations=iterations, **SOLVER
     )  # fmt: skip
     np.testing.assert_allclose(found.x, wanted.x, atol=1e-7)
-    # At the same poses: where energies are steep, gradients tell of the last digits of poses.
+    # At the same poses, because steep energies amplify the last digits of poses.
     value, gradient, _ = reference.energy(found.x, np.arange(COUNT))
     check_same((found.value, found.gradient), (value, gradient))
     for part in ('free', 'status', 'iterations'):
@@ -198,7 +198,7 @@ def test_minima_are_those_of_the_solver_step_by_step(terms, poses, body, name, i
 
 
 def test_each_pose_is_worked_on_alone(terms, poses):
-    """The same bytes in any company, and so with any number of threads."""
+    """Results do not depend on other poses in a batch or on the number of threads."""
     likelihood, some = terms['all']
     own = PoseEnergy(likelihood, some, motion_of(poses, 'gaussian', 37))
     together = own.energy(poses)

@@ -1,4 +1,4 @@
-"""A camera that was moved is noticed; people and light are not taken for it."""
+"""A moved camera is noticed; people and changes of light are not mistaken for it."""
 
 from functools import cache
 
@@ -25,7 +25,7 @@ def room():
 
 
 def seen(room, index, shift=(0.0, 0.0), angle=0.0, light=1.0):
-    """The room with noise, and somebody who walks through it, from a camera that was moved."""
+    """The room with noise and a person who walks through it, from a moved camera."""
     image = room.copy()
     left = 40 + 6 * index
     cv2.rectangle(image, (left, 120), (left + 110, 460), (40, 60, 200), -1)
@@ -39,12 +39,12 @@ def seen(room, index, shift=(0.0, 0.0), angle=0.0, light=1.0):
 
 @pytest.fixture(scope='module')
 def still(room):
-    """Function (index) -> the image of a camera that stands where it stood, drawn once."""
+    """Function (index) -> the image of a camera that has not moved, drawn once."""
     return cache(lambda index: seen(room, index))
 
 
 def watched(room, still, count=60, **change):
-    """The watch after a change in the middle, and the image at which it was noticed."""
+    """The watch after a change in the middle, and the index of the image that revealed it."""
     watch, background, first = SceneWatch(), BackgroundModel.from_image(room), None
     for index in range(count):
         image = seen(room, index, **change) if index >= count // 2 else still(index)

@@ -1,4 +1,4 @@
-"""Subject files: what good ones say, and one line about bad ones."""
+"""Subject files: content of valid ones, and one error line for invalid ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def body():
 
 
 def content(**entries):
-    """Content of a subject file; entries that are None are left out."""
+    """Content of a subject file; entries with None are omitted."""
     values = {'stamp_ns': 1_500_000_000, 'keypoints': JOINTS} | entries
     return {key: value for key, value in values.items() if value is not None}
 

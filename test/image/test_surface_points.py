@@ -1,4 +1,4 @@
-"""Points of the surface: where they are, and which the camera sees."""
+"""Points on the surface: where they are, and which of them the camera sees."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def points(shot, poses) -> SurfacePoints:
 
 
 def used(points, k):
-    """Segments, places and pixels of one pose, without the rest of its row."""
+    """Segments, places and pixels of one pose, without the unused rest of its row."""
     return tuple(x[k, : points.counts[k]] for x in points[1:])
 
 
@@ -64,7 +64,7 @@ def test_points_project_to_their_pixels(shot, poses, points):
 
 
 def test_points_face_the_camera_and_nothing_is_before_them(shot, poses, points):
-    """Along the ray to a point, short of it, no other part is met."""
+    """The ray from the camera to a point meets no other part before it."""
     body = shot.body
     for k, pose in enumerate(poses):
         frames = forward(body.skeleton, pose[None])

@@ -1,4 +1,4 @@
-"""Which limbs an image shows: by keypoints, or by being in it."""
+"""Visible limbs of an image, from keypoints or from the image borders."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ def body():
 
 @pytest.fixture(scope='module')
 def pose(body):
-    """Of a person who stands, 3 m away."""
+    """Pose of a person who stands 3 m away."""
     result = body.prior_mean.copy()
     result[2] = 3.0
     return result
@@ -101,7 +101,7 @@ def test_unseen_joints_err_by_the_lengths_of_their_bones(body, pose):
 
 
 def sure_of(made, *kinds):
-    """Keypoints of which the detector is sure only where a name has one of these parts."""
+    """Keypoints that are confident only if their names contain one of these parts."""
     sure = [any(x in name for x in kinds) for name in made.names]
     return replace(made, confidences=np.where(sure, 0.9, 0.3))
 
@@ -118,7 +118,7 @@ def test_a_leg_is_hidden_where_a_detector_is_sure_of_nothing_beyond_its_hip(body
     assert lost == {'right_knee', 'right_ankle', 'right_toe'}
     _, shank, foot = body.skeleton.chains['right_leg']
     assert limbs.hidden.nonzero()[0].tolist() == [shank, foot]
-    # A limb without any keypoint may be one that the detector does not know.
+    # A limb without any keypoint may be unknown to the detector.
     arms = said[np.flatnonzero([any(y in x for y in TRUNK_AND_ARMS) for x in said.names])]
     assert limbs.without_guesses(body, arms, 2) is arms
 

@@ -1,4 +1,4 @@
-"""The vertical by the lines of a scene: drawn rooms, clutter, and what tells nothing."""
+"""The vertical from the lines of a scene: drawn rooms, clutter, and uninformative images."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def boards() -> np.ndarray:
 
 
 def angle(up: np.ndarray, rotation: np.ndarray) -> float:
-    """Between a vertical and the true one, deg."""
+    """Angle between a vertical and the true one, deg."""
     true = rotation @ np.array([0.0, -1.0, 0.0])
     return float(np.degrees(np.arccos(np.clip(up @ true, -1.0, 1.0))))
 
@@ -34,7 +34,7 @@ def test_furniture_shows_the_vertical(pitch, roll):
 
 
 def test_boards_of_a_floor_are_not_the_vertical():
-    """Seen from above they converge as uprights would before a camera that looks up."""
+    """From above, they converge like vertical lines in front of a camera that looks up."""
     rotation = turn(np.radians(30.0), 0.0)
     assert seen_vertical(drawn(boards(), rotation), CAMERA) is None
     both = seen_vertical(drawn(np.concatenate([boards(), room()]), rotation), CAMERA)

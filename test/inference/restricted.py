@@ -1,4 +1,4 @@
-"""A term over some of the variables, which tests compare compiled sums with."""
+"""A term over some of the variables, with which tests compare compiled sums."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from hmt_ros.inference.energy import Derivatives, Energy, EnergyTerm
 
 @dataclass(frozen=True, eq=False)
 class Restricted:
-    """A term over some of the variables; the others stay where they are.
+    """A term over some of the variables; the others are constant.
 
     Attributes:
-        term: over all d variables.
-        point: (d,) values of all variables.
-        free: (f,) the variables that may move.
+        term: term over all d variables.
+        point: values (d,) of all variables.
+        free: indices (f,) of the variables that may change.
     """
 
     term: EnergyTerm

@@ -1,4 +1,4 @@
-"""The bounded Newton method against scipy, and what it promises about batches."""
+"""The bounded Newton method, compared with scipy, and its guarantees for batches."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hmt_ros.inference.energy import EnergyFunction
 
 
 def minimum(objective, *arguments, **options) -> Minimum:
-    """Of an energy that is written as a function."""
+    """Minimum of an energy given as a function."""
     return minimise(EnergyFunction(objective), *arguments, **options)
 
 
@@ -175,7 +175,7 @@ def test_converged_problems_leave_the_batch():
 
 
 def wells(x, problem):
-    """Elementwise arithmetic only: a row has the same bits whatever stands beside it."""
+    """Elementwise arithmetic only, so that a row does not depend on other rows."""
     value = (0.1 * x**4 - x**2 + 0.3 * x * (problem[:, None] % 5)).sum(1)
     gradient = 0.4 * x**3 - 2 * x + 0.3 * (problem[:, None] % 5)
     hessian = np.zeros((*x.shape, x.shape[1]))

@@ -1,4 +1,4 @@
-"""Levels of highest-density regions against closed forms, a grid, and their own distribution."""
+"""Levels of highest-density regions against closed forms, a grid and their distribution."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def test_level_of_a_mixture_agrees_with_quadrature():
     wanted = [density[density > p].sum() * (grid[1] - grid[0]) for p in at_points]
     samples = stratified_samples(mixture, 40_000, np.random.default_rng(0))
     levels = levels_under(mixture, points, samples)
-    # The narrow mode is the densest: its level is low although it has the smaller weight.
+    # The narrow mode is the densest, so its level is low despite its smaller weight.
     assert wanted[3] < 0.3
     assert np.allclose(levels, wanted, atol=0.01)
 

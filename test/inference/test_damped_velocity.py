@@ -1,4 +1,4 @@
-"""Damped velocities with coupled noise against the general transition and small steps."""
+"""Damped velocities with coupled noise, compared with the general transition and small steps."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_transitions_are_those_of_the_general_dynamics(dynamics, interval):
 
 
 def test_transitions_are_the_limit_of_small_steps(dynamics):
-    """Euler's method with 20000 steps, of moments."""
+    """Euler's method for the moments with 20000 steps."""
     interval, count = 0.2, 20_000
     h = interval / count
     step = np.eye(6) + h * dynamics.drift

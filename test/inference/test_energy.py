@@ -85,7 +85,7 @@ def test_a_student_tends_to_the_quadratic():
 
 
 def test_a_student_falls_off_as_a_power():
-    """(nu + d)/2 log of the squared distance, far out."""
+    """Far out the energy is (nu + d)/2 times the log of the squared distance."""
     term = Student(np.zeros(D), np.eye(D), 3.0)
     far = term.energy(np.array([[1e6, 0, 0], [1e8, 0, 0]]), np.zeros(2, dtype=int)).value
     assert far[1] - far[0] == pytest.approx(0.5 * (3 + D) * np.log(1e4))

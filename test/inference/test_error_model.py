@@ -1,4 +1,4 @@
-"""The share of measurements with lasting errors, against the variance of their mean."""
+"""The share of measurements with correlated errors, compared with the variance of their mean."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from hmt_ros.inference.error_model import ERRORS, CueErrors, errors_of_cues, sha
 @pytest.mark.parametrize('dt', [0.01, 0.1, 0.4, 2.0])
 @pytest.mark.parametrize('tau', [0.05, 0.2, 1.0])
 def test_it_is_the_information_of_an_autoregressive_error(dt, tau):
-    """A long run of n measurements holds as much of a constant as a(dt) n independent ones."""
+    """A long run of n measurements determines a constant like a(dt) n independent ones."""
     n = 1200
     covariance = toeplitz(np.exp(-np.arange(n) * dt / tau))
     information = np.ones(n) @ np.linalg.solve(covariance, np.ones(n))
     rho = math.exp(-dt / tau)
-    # The first and the last of the run have one neighbour: the exact sum over them.
+    # The exact sum; the first and the last measurement have only one neighbour.
     exact = (n - (n - 2) * rho) / (1 + rho)
     assert information == pytest.approx(exact, rel=1e-9)
     share = share_of_time(dt, tau)
@@ -59,7 +59,7 @@ def test_an_image_says_no_more_than_its_share_of_space(name):
 def test_a_second_of_more_images_says_no_less(name):
     found = [rate * ERRORS[name].share(1.0 / rate) for rate in (1.0, 3.0, 8.0, 30.0, 1000.0)]
     assert (np.diff(found) > 0.0).all()
-    # There is an end to it, however many there are.
+    # The information is bounded for any number of measurements.
     assert found[-1] <= ERRORS[name].independent / (2.0 * ERRORS[name].time)
 
 
@@ -72,7 +72,7 @@ def test_the_rate_hardly_matters_where_errors_last_longer_than_the_interval(time
 
 
 def test_one_pair_for_several_cues(monkeypatch):
-    """It has the mean share of its cues at low rates of images, and at high rates."""
+    """It has the mean share of its cues, at low and at high image rates."""
     table = {'image': CueErrors(0.2, 0.5), 'keypoints': CueErrors(0.6, 0.05)}
     monkeypatch.setattr(error_model, 'ERRORS', table)
     amounts = {'image': 3.0, 'keypoints': 1.0}
@@ -103,17 +103,17 @@ def test_cues_with_one_pair_have_it_together(monkeypatch):
 
 @pytest.mark.parametrize('rho', [0.01, 0.3, 0.8])
 def test_changes_of_what_lasts_are_told_by_what_is_new_of_it(rho):
-    """Against an autoregressive error, simulated."""
+    """Compared with a simulated autoregressive error."""
     tau, s = 0.1, 0.5
     dt = -tau * np.log(rho)
     errors = CueErrors(s, tau)
     rng = np.random.default_rng(0)
     new = np.sqrt((1.0 - rho**2) / s) * rng.normal(size=200_000)
     error = lfilter([1.0], [1.0, -rho], new)
-    # Of the next error, what those before do not tell.
+    # The part of the next error that the previous ones do not determine.
     unknown = np.var(error[1:] - rho * error[:-1])
     assert unknown == pytest.approx(1.0 / errors.of_changes(dt), rel=0.02)
-    # Of the mean of n, what there is in n images that count with their share.
+    # The variance of the mean of n errors, compared with n discounted images.
     means = error[: 200_000 // 500 * 500].reshape(-1, 500).mean(1)
     assert 500 * np.var(means) == pytest.approx(1.0 / errors.share(dt), rel=0.15)
     assert errors.lasting(dt) == pytest.approx(1.0 / (1.0 - rho) ** 2)

@@ -46,7 +46,7 @@ def test_after_a_long_time_it_is_as_usual(chain):
 
 
 def test_two_states_are_named_by_the_rates():
-    """It begins three times as often as it ends."""
+    """The state begins three times as often as it ends."""
     assert MarkovChain.of_two(0.3, 0.1).usual == pytest.approx([0.25, 0.75])
     assert MarkovChain.of_two(0.3, 0.1).predict([1.0, 0.0], 1e-6)[1] == pytest.approx(0.3e-6)
 

@@ -1,4 +1,4 @@
-"""Gaussian mixtures against scipy, quadrature and their moments."""
+"""Gaussian mixtures, compared with scipy, quadrature and their moments."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_samples_follow_their_seed():
 
 
 def test_samples_have_the_density():
-    """Fractions of samples in cells against the density integrated over them."""
+    """Compares fractions of samples in cells with the integrated density."""
     mixture = random_mixture(3, 1, 9)
     x = mixture.sample(100_000, np.random.default_rng(3))[:, 0]
     edges = np.linspace(-12, 12, 25)

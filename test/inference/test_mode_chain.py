@@ -1,4 +1,4 @@
-"""The chain of a filter's modes, against all of its paths one by one."""
+"""The chain of a filter's modes against an enumeration of all its paths."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def make_chain(counts=COUNTS, seed=0):
 
 
 def by_paths(links):
-    """All paths, and the probability of each: equation (3), a factor at a time."""
+    """All paths and their probabilities, by equation (3), factor by factor."""
     paths = [*itertools.product(*(range(len(link.weights)) for link in links))]
     masses = []
     for path in paths:
@@ -46,7 +46,7 @@ def test_backward_weights_are_the_sums_over_all_paths(seed):
     found = backward_weights(links)
     for weights, wanted in zip(found, marginals(*by_paths(links)), strict=True):
         np.testing.assert_allclose(weights, wanted, atol=1e-14)
-    # The newest image has the weights of the filter, to the last bit, and others have not.
+    # The newest image has exactly the weights of the filter; the others do not.
     assert found[-1] is links[-1].weights
     assert np.abs(found[1] - links[1].weights).max() > 0.01
 
@@ -68,7 +68,7 @@ def test_paths_are_drawn_from_the_chain(seed):
     np.testing.assert_allclose(oldest, wanted, atol=1e-15, rtol=1e-12)
     for found, wanted in zip(marginals(nodes, weights), backward_weights(links), strict=True):
         np.testing.assert_allclose(found, wanted, atol=0.01)
-    # Whole paths too, not their modes alone.
+    # This holds for whole paths, too, not only for their modes.
     every, masses = by_paths(links)
     names, drawn = np.unique(nodes, axis=0, return_inverse=True)
     shares = dict(zip(map(tuple, names), np.bincount(drawn.reshape(-1), weights), strict=True))
@@ -78,7 +78,7 @@ def test_paths_are_drawn_from_the_chain(seed):
 
 
 def test_few_paths_keep_the_weights_of_the_oldest_modes():
-    """Each mode that is possible given later images begins a path, however light it is."""
+    """Each mode that is possible given later images begins a path, whatever its weight."""
     chain, origins = make_chain((5,)), np.array([[0.9, 0.0, 1e-9, 0.07, 0.03 - 1e-9]])
     nodes, shares = drawn_paths([*chain, Link(np.ones(1), origins)], 8, seed=0)
     assert set(nodes[:, 0].tolist()) == {0, 2, 3, 4}
@@ -87,7 +87,7 @@ def test_few_paths_keep_the_weights_of_the_oldest_modes():
 
 
 def test_systematic_paths_are_nearer_than_independent_ones():
-    """Of 128 paths from one mode through an even branch, half go each way, but for one."""
+    """Of 128 paths from one mode through an even branch, half go each way, give or take one."""
     branch = Link(np.ones(1), np.array([[0.5, 0.5]]))
     links = [Link(np.array([0.5, 0.5]), np.empty((2, 0))), branch]
     for seed in range(20):
@@ -106,8 +106,8 @@ def test_the_same_seed_draws_the_same_paths():
 def test_origins_that_nobody_has_told_are_those_within_reach():
     away = np.array([[0.1, 0.2, 0.9], [0.9, 0.9, 0.9], [0.9, 0.9, 0.1]])
     found = reachable_origins(away, np.array([0.2, 0.6, 0.2]), 0.25)
-    # None is within reach of the second mode: all are.
+    # No mode is within reach of the second one, so all count as reachable.
     np.testing.assert_allclose(found, [[0.25, 0.75, 0.0], [0.2, 0.6, 0.2], [0.0, 0.0, 1.0]])
-    # One that has no weight is not continued, near as it may be.
+    # A mode without weight is not continued, however near it is.
     found = reachable_origins(away, np.array([0.4, 0.6, 0.0]), 0.25)
     np.testing.assert_allclose(found, [[0.4, 0.6, 0.0]] * 3)

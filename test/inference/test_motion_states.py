@@ -1,4 +1,4 @@
-"""States of modes against a Kalman filter and a brute-force joint Gaussian."""
+"""States of modes, compared with a Kalman filter and a brute-force joint Gaussian."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_over_a_sequence_it_is_the_kalman_filter():
 
 
 def test_limbs_that_jumped_tell_nothing_and_have_a_velocity_of_which_nothing_is_known():
-    """The others are conditioned on the joint Gaussian without them."""
+    """Other limbs are conditioned on the joint Gaussian without the jumped ones."""
     states = predicted()
     jumped = np.array([[False, True, False]])
     pose = states.poses + np.array([[0.1, 2.0, -0.2]])

@@ -1,4 +1,4 @@
-"""Reduction of mixtures: moments stay, little is lost, and what is to be merged is."""
+"""Reduction of mixtures: moments are kept, little is lost, close components are merged."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Work that is shared among threads."""
+"""Work divided among threads."""
 
 import threading
 import time

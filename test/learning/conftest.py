@@ -1,4 +1,4 @@
-"""What the tests of learning share."""
+"""Fixtures shared by the tests of learning."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from hmt_learning.app import motions
 
 
 class ThisProcess:
-    """What stands in for a pool of processes, each of which takes a second to start."""
+    """A substitute for a pool of processes, each of which takes a second to start."""
 
     def __init__(self, *_):
         pass

@@ -15,10 +15,10 @@ def figure(
     """Parent and offset of each joint, in the order of the file.
 
     Args:
-        size: scales all of it.
-        arms: scales the arms.
-        hips: scales the drop of the hips below the root.
-        hang: whether the arms hang down, in place of a T.
+        size: scale of the whole figure.
+        arms: scale of the arms.
+        hips: scale of the height of the root above the hips.
+        hang: whether the arms hang down instead of forming a T.
     """
     chains = [('Hips', {'Spine': (0, 0.15, 0), 'Neck': (0, 0.28, 0), 'Head': (0, 0.18, 0)})]
     legs = []

@@ -22,7 +22,7 @@ Read = Callable[[Path], tuple[list[tuple[int, str, bytes]], str | None]]
 
 @contextmanager
 def limited_file_size(count: int) -> Iterator[None]:
-    """A file that becomes longer than this is an error, as a full disk is."""
+    """Within the context, files longer than `count` bytes raise an error, like a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (count, before[1]))
@@ -50,7 +50,7 @@ def messages() -> RosbagsMessages:
 
 @pytest.fixture(scope='session')
 def read() -> Read:
-    """Reads all of a bag: (time, topic, bytes) of what came, and the error or cut that ended it."""
+    """Reads a bag: (time, topic, bytes) of its messages, and the error or cut that ended it."""
 
     def read_bag(path: Path) -> tuple[list[tuple[int, str, bytes]], str | None]:
         found = []

@@ -1,4 +1,4 @@
-"""Who talks to a node; fixtures of the sessions serve here, too."""
+"""Clients of nodes; fixtures of the sessions are used here, too."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ from test.sessions.conftest import (  # noqa: F401
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 60.0  # s
-DISCOVERY = 5.0  # s, after which a client that no service has answered is made once more
+DISCOVERY = 5.0  # time after which a client without a service is created again, s
 
 
 class World:
-    """A node, and somebody who talks to it, in a context of their own.
+    """A node and a second node that talks to it, in their own context.
 
     Args:
-        stderr: of the test.
+        stderr: captured stderr of the test.
         kind: class of the node.
-        name: of the node.
+        name: name of the node.
         inputs: class of the messages by topic.
-        values: of parameters.
+        values: values of parameters.
     """
 
     def __init__(self, stderr, kind, name, inputs, **values):
@@ -86,7 +86,7 @@ class World:
         return self.other.create_subscription(kind, topic, receive, qos)
 
     def hear(self, kinds):
-        """Listens to topics, by their classes; returns lists of messages once the node knows."""
+        """Subscribes to topics; returns lists of messages once the node knows the subscriptions."""
         found = {topic: [] for topic in kinds}
         for topic, kind in kinds.items():
             self.listen(kind, topic, found[topic])
@@ -94,7 +94,7 @@ class World:
         return found
 
     def is_heard(self, topic):
-        """Whether the node knows of somebody who listens to a topic of its own."""
+        """Whether the node knows a subscriber of its topic."""
         name = self.node.resolve_topic_name(topic)
         return any(
             one.topic_name == name and one.get_subscription_count() for one in self.node.publishers
@@ -102,16 +102,16 @@ class World:
 
     @property
     def session(self):
-        """What estimates in the node; None while it is not configured."""
+        """The session of the node; None while it is not configured."""
         return self.node._session
 
     @property
     def estimator(self):
-        """What gives the session its messages; None while the node is not active."""
+        """The object that passes messages to the session; None while the node is inactive."""
         return self.node._estimator
 
     def receive(self, source, data):
-        """Hands bytes to the node, as the middleware does."""
+        """Passes bytes to the node, as the middleware does."""
         from hmt_ros.nodes.estimating_thread import received
 
         wanted = {one.source: (name, one) for name, one in self.node._heard.items()}
@@ -119,17 +119,17 @@ class World:
         self.node._hear(name, received(data, one))
 
     def limit(self, source):
-        """How many messages of a source may wait."""
+        """Queue length of a source."""
         return self.estimator.queue._limits[source]
 
     def own_periods(self):
-        """Stops the clock of the diagnostics; returns what ends a period."""
+        """Stops the timer of the diagnostics; returns a function that ends a period."""
         (timer,) = self.node.timers
         timer.cancel()
         return timer.callback
 
     def event(self, topic, kind, **content):
-        """Has the middleware tell the node of an event of a subscription or a publisher."""
+        """Simulates a middleware event of a subscription or a publisher."""
         (told,) = (
             handler.callback
             for one in (*self.node.subscriptions, *self.node.publishers)
@@ -152,7 +152,7 @@ class World:
         return self.connect()
 
     def connect(self):
-        """Returns when both sides know all topics of each other."""
+        """Waits until both sides know all topics of each other."""
         self.spin_until(
             lambda: (
                 all(p.get_subscription_count() for p in self.publishers.values())
@@ -164,7 +164,7 @@ class World:
         return self
 
     def send(self, source, message, topic=None):
-        """Publishes a message, on the topic of its source's name or another; what became of it."""
+        """Publishes a message on its source's topic or another; returns the result."""
         count = len(self.handled)
         self.publishers[topic or source].publish(serialise(message))
         # A latched message may be handled in between.
@@ -176,7 +176,7 @@ class World:
 
     @staticmethod
     def of_ros(message):
-        """A message of rosbags as one of ROS."""
+        """Converts a message of rosbags to one of ROS."""
         from rclpy.serialization import deserialize_message
 
         package, _, name = message.__msgtype__.split('/')
@@ -184,7 +184,7 @@ class World:
         return deserialize_message(serialise(message), kind)
 
     def client(self, kind, service):
-        """A client that its service knows; discovery now and then loses one that is new."""
+        """A connected client; created again if discovery misses a new one."""
         end = time.monotonic() + PATIENCE
         while True:
             client = self.other.create_client(kind, f'{self.name}/{service}')
@@ -217,7 +217,7 @@ class World:
         return self.call(GetState, 'get_state').current_state.label
 
     def set(self, **values):
-        """Sets parameters; the reasons why not, once a busy machine has read the files of them."""
+        """Sets parameters; returns the reasons for refusals. Waits long, as files may be read."""
         from rcl_interfaces.srv import SetParametersAtomically
         from rclpy.parameter import Parameter
 
@@ -234,7 +234,7 @@ class World:
                 return result.successful, result.reason
 
     def assert_described(self, defaults, *others):
-        """Parameters are those of the files, with their descriptions; all of them by name.
+        """Checks that the parameters and their descriptions are those of the files.
 
         `others` are nodes whose parameters this one has, too.
         """
@@ -248,7 +248,7 @@ class World:
         return declared
 
     def assert_refused(self, *cases):
-        """Every case, values and a part of the reason, is refused."""
+        """Checks that every case, values and a part of the reason, is refused."""
         for values, reason in cases:
             good, why = self.set(**values)
             assert not good
@@ -265,8 +265,8 @@ class World:
     def _texts(self, *levels):
         """Texts that the node has logged with some levels.
 
-        From stderr: what contexts that have ended in this process leave behind may keep /rosout
-        of a node with the same name silent.
+        They are read from stderr, because ended contexts in this process may disable /rosout of a
+        node with the same name.
         """
         self.logged += self.stderr.readouterr().err
         head = re.compile(rf'^\[(\w+)\] \[[0-9.]+\] \[{self.name}\]: ', re.MULTILINE)
@@ -275,7 +275,7 @@ class World:
         return [text.strip() for level, text in entries if level in levels]
 
     def diagnosis(self):
-        """The diagnostics of a period that ends now: level, message, values."""
+        """Ends a period of diagnostics; returns level, message and values."""
         from rclpy.time import Time
 
         now = self.node.get_clock().now()
@@ -299,7 +299,7 @@ class World:
 
 @pytest.fixture
 def world_of(capfd, monkeypatch):
-    """Makes worlds, and ends them; their nodes do not tell of silence until `patience` says so."""
+    """Creates and ends worlds; their nodes do not report silence before `patience`."""
     worlds = []
 
     def make(*arguments, **values):
@@ -316,7 +316,7 @@ def world_of(capfd, monkeypatch):
 
 
 def only_line(code, output):
-    """What a node said that has not started."""
+    """The error line of a node that has not started."""
     assert code == 1
     (line,) = output.splitlines()
     return line
@@ -324,16 +324,16 @@ def only_line(code, output):
 
 @pytest.fixture
 def ended(capfd, monkeypatch):
-    """Runs nodes that end by themselves, in this process: exit code, output, and errors."""
+    """Runs nodes that end by themselves in this process; returns code, output and errors."""
     numbers = signal.SIGINT, signal.SIGTERM
     handlers, threads = [signal.getsignal(number) for number in numbers], cv2.getNumThreads()
-    # It would be for good.
+    # The change would be permanent.
     monkeypatch.setattr('hmt_ros.nodes.run_node._use_one_heap', lambda: None)
 
     def run(name, *arguments):
         main = import_module(f'hmt_ros.nodes.{name}').main
         capfd.readouterr()
-        # One that does not end is stopped as the interrupt key does it, and its code is 0.
+        # A node that does not end is interrupted, and its code is 0.
         guard = threading.Timer(PATIENCE, os.kill, [os.getpid(), signal.SIGINT])
         guard.start()
         try:
@@ -352,11 +352,11 @@ def ended(capfd, monkeypatch):
 
 
 class Executable:
-    """A node in a process of its own.
+    """A node in its own process.
 
     Args:
-        name: of the node.
-        arguments: behind --ros-args.
+        name: name of the node.
+        arguments: arguments after --ros-args.
     """
 
     def __init__(self, name, *arguments):
@@ -370,9 +370,9 @@ class Executable:
         )
 
     def stop_at(self, text, number=signal.SIGINT):
-        """Sends signals from when the node says a text; all lines of a node that ends well.
+        """Sends signals after the node prints a text; returns all lines of a node that ends well.
 
-        One more comes while it ends: a terminal and "ros2 launch" send one each.
+        A second one is sent during shutdown, because a terminal and "ros2 launch" send one each.
         """
         lines = []
 

@@ -1,4 +1,4 @@
-"""The BME node itself, over DDS."""
+"""The BME node over DDS."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The driver of a webcam, with a file in its place."""
+"""The webcam driver, with a file instead of a webcam."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from test.nodes.conftest import ROOT
 pytestmark = pytest.mark.ros
 
 
-# Listens in a process of its own, and writes what has come, each behind its length, to two files.
+# Listener process that writes received messages, with their lengths, to two files.
 LISTENER = """
 import struct, sys, rclpy
 from rclpy.qos import qos_profile_sensor_data
@@ -51,7 +51,7 @@ def messages_in(path, msgtype):
 
 @pytest.fixture
 def shown(walk_video, tmp_path, ended):
-    """Runs the node with a listener: what it published, and what it said."""
+    """Runs the node with a listener; returns its messages and its output."""
 
     def run(*options):
         listener = subprocess.Popen([sys.executable, '-c', LISTENER, str(tmp_path)])
@@ -74,7 +74,7 @@ def shown(walk_video, tmp_path, ended):
 def test_a_file_is_shown_at_its_rate_with_the_calibration_of_its_view(shown):
     read, said = shown('--fov', '60')
     images, infos = read['image_raw'], read['camera_info']
-    # Sensor data: the first may be lost while both sides connect.
+    # With sensor-data QoS the first messages may be lost during connection.
     assert len(images) >= 6
     stamps = [time_ns(message.header.stamp) for message in images]
     assert set(np.diff(stamps)) <= {100_000_000, 200_000_000}
@@ -92,7 +92,7 @@ def test_an_unknown_field_of_view_is_told(shown):
     read, said = shown('--frame-id', 'eye')
     assert read['image_raw'][0].header.frame_id == 'eye'
     assert said.count('neither --calibration nor --fov is given') == 1
-    assert 'taken to be 60 degrees' in said
+    assert 'assumed to be 60 degrees' in said
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,11 @@ def test_an_unknown_field_of_view_is_told(shown):
     [
         (['nowhere.mp4'], 1, 'camera_node: nowhere.mp4: no such file; wanted a video, or /dev/'),
         (['README.md'], 1, 'camera_node: README.md is not a video that OpenCV can read'),
-        (['/dev/video87'], 1, '/dev/video87 can not be opened; wanted a webcam that nobody uses'),
+        (
+            ['/dev/video87'],
+            1,
+            '/dev/video87 can not be opened; wanted a webcam that no other program uses',
+        ),
         (['a.mp4', '--fov', '200'], 2, '200 degrees: wanted an angle from 1 to 170'),
         (['a.mp4', '--fov', '60', '--calibration', 'x'], 2, 'not allowed with argument --fov'),
     ],
@@ -113,7 +117,7 @@ def test_a_camera_that_can_not_be_used(arguments, code, text, ended, monkeypatch
 
 
 def test_a_mirrored_file_is_refused(walk_video, tmp_path, ended):
-    """OpenCV would turn it by 180 degrees."""
+    """OpenCV would rotate it by 180 degrees."""
     content = bytearray((walk_video / 'walk.mp4').read_bytes())
     at = content.index(b'tkhd') + 44
     struct.pack_into('>i', content, at, -struct.unpack_from('>i', content, at)[0])
@@ -121,10 +125,10 @@ def test_a_mirrored_file_is_refused(walk_video, tmp_path, ended):
     path.write_bytes(content)
     code, _, errors = ended('camera_node', str(path), '--fov', '60')
     assert code == 1
-    assert f'{path}: its metadata mirror the images; write them as players show them' in errors
+    assert f'{path}: its metadata mirror the images; convert it with ffmpeg' in errors
 
 
-# A lifecycle node, in a process of its own, that activates itself when a listener is long there.
+# A lifecycle node in its own process that activates itself long after a listener has started.
 LATE = """
 import sys, time, rclpy
 from rclpy.lifecycle import LifecycleNode
@@ -143,7 +147,7 @@ rclpy.spin(node)
 
 
 def test_a_file_waits_for_nodes_that_are_named(shown):
-    """Although a listener is there from the beginning."""
+    """It waits although a listener is present from the beginning."""
     late = subprocess.Popen([sys.executable, '-c', LATE], stdout=subprocess.PIPE, text=True)
     try:
         read, said = shown('--fov', '60', '--ros-args', '-p', 'wait_for:=late', '--')
@@ -159,7 +163,7 @@ def test_a_file_waits_for_nodes_that_are_named(shown):
 
 @pytest.fixture
 def clip(walk_video, monkeypatch):
-    """Images of a file and the times at which they are due, s, with the waits that it asked for."""
+    """Images of a file with their due times, s, and the requested waits."""
 
     def play(count, **options):
         waits = []
@@ -205,7 +209,7 @@ def test_parameters_are_described_and_checked(ended):
 
 
 class Webcam:
-    """Gives two images, is then unplugged, and gives others when it was opened the third time."""
+    """Webcam with two images that is then unplugged, and works again when opened a third time."""
 
     def __init__(self, device):
         self.opened, self.left = [device], 2

@@ -1,4 +1,4 @@
-"""What a node tells of itself: rates, silence, errors, events of the middleware, a status line."""
+"""Diagnostics of a node: rates, silence, errors, middleware events, a status line."""
 
 import re
 import time
@@ -24,7 +24,7 @@ def running(stub_tracker, subject_file, world_of):
 
 @pytest.fixture
 def smoother(world_of):
-    """A smoother to which nobody publishes mixtures."""
+    """A smoother without a publisher of mixtures."""
     from hmt_ros.nodes.smoother_node import SmootherNode
 
     return world_of(SmootherNode, 'smoother_node', {}).start()
@@ -45,16 +45,16 @@ def test_publisher_that_does_not_fit_is_one_warning_with_topic_and_policy(smooth
     ]
     key = 'publishers of /likelihood_mixture with another reliability'
     smoother.spin_until(lambda: smoother.diagnosis()[2].get(key) == '2', 'both events')
-    # The other node complains as well, in lines behind.
+    # The other node logs warnings, too, in later lines.
     assert [text.splitlines()[0] for text in smoother.warnings()] == [
         '/likelihood_mixture: a publisher offers another reliability than is asked for, none of '
         'its messages will arrive; see "ros2 topic info --verbose /likelihood_mixture" (more of '
-        'the kind are counted in /diagnostics)'
+        'this kind are counted in /diagnostics)'
     ]
     level, message, _ = smoother.diagnosis()
     assert level == 1
     assert message == '/likelihood_mixture: publishers offer another reliability than is asked for'
-    # One that fits is all that is needed.
+    # One compatible publisher is enough.
     good = smoother.other.create_publisher(PoseMixture, 'likelihood_mixture', 10)
     smoother.spin_until(
         lambda: smoother.diagnosis()[1] == 'waits for likelihood_mixture', 'the publisher'
@@ -106,7 +106,7 @@ def status_lines(world):
 
 
 def test_status_line(running, small_camera, stub_tracker):
-    """At once, then after ten periods of diagnostics in which something has come."""
+    """It is logged at once, then after ten diagnostics periods with input."""
     period = running.own_periods()
     period()
     assert status_lines(running) == []
@@ -126,7 +126,7 @@ def test_status_line(running, small_camera, stub_tracker):
         period()
         period()
     assert len(status_lines(running)) == 3
-    # Another status is told at once.
+    # Another status is logged at once.
     image = small_camera.image(11)
     stub_tracker.empty.add(image.header.stamp.sec * 10**9 + image.header.stamp.nanosec)
     running.send('image', image)
@@ -137,7 +137,7 @@ def test_status_line(running, small_camera, stub_tracker):
 
 
 def test_what_diagnostics_tell_is_what_the_page_says(running, small_camera):
-    """No key without an explanation in docs/nodes.md, and none explained that is not there."""
+    """docs/nodes.md explains every key, and no others."""
     running.send('camera_info', small_camera.info())
     running.send('camera_info', small_camera.uncalibrated())
     running.send('image', small_camera.image(0))
@@ -153,7 +153,7 @@ def test_what_diagnostics_tell_is_what_the_page_says(running, small_camera):
         key: re.compile(r'[\w/~]+'.join(re.escape(text) for text in re.split(r'<\w+>', key)))
         for key in explained
     }
-    # What this node alone tells.
+    # Keys of this node only.
     own = {'misfit', 'evaluations of the likelihood', 'probability that a person is in view'}
     running.spin_until(lambda: 'nothing on /image' in running.diagnosis()[2], 'all of it')
     keys = running.diagnosis()[2].keys() - own

@@ -1,4 +1,4 @@
-"""Queues and turns, without ROS."""
+"""Queues of the estimating thread and their order, without ROS."""
 
 import threading
 import time
@@ -75,7 +75,7 @@ def test_some_of_what_waits_is_taken():
 
 
 class Busy:
-    """Sessions that only say whose turn it is, and take their time."""
+    """Stub sessions that record their turns and take some time."""
 
     def __init__(self):
         self.turns, self.may_go = [], threading.Semaphore(0)
@@ -136,7 +136,7 @@ def test_turns_go_round_and_what_can_wait_waits(busy, monkeypatch):
     for count in (2, 3, 4):
         busy.go()
         busy.until(*seen[:count])
-    # One at a time: an image may have come.
+    # One message per turn, because an image may have arrived.
     send(second, 4)
     busy.until(*seen, ('second', 4))
     busy.go()
@@ -168,7 +168,7 @@ def test_who_stops_has_no_more_turns_and_the_others_go_on(busy):
     busy.until(('one', 1), ('other', 1))
     busy.go()
     assert other.stop(PATIENCE)
-    # The thread has ended; it begins again for the next message.
+    # The thread has ended; it restarts for the next message.
     again = busy.serve('again', 0)
     send(again, 1)
     busy.until(('one', 1), ('other', 1), ('again', 1))
@@ -180,7 +180,7 @@ def test_a_picture_is_decoded_once(small_camera):
     picture = one.decode(message)
     assert one.decode(message) is picture
     assert other.decode(message) is not picture
-    # What comes later takes its place.
+    # Later messages take its place.
     for index in range(SHARED):
         one.decode(small_camera.image(index))
     assert one.decode(message) is not picture

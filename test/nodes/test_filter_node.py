@@ -1,4 +1,4 @@
-"""The node itself, over DDS; with a tracker that costs nothing."""
+"""The filter node over DDS, with a stub tracker."""
 
 import re
 import signal
@@ -18,7 +18,7 @@ from test.nodes.conftest import PATIENCE, only_line
 pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parents[2]
-# Published when a track starts, whether anybody listens or not.
+# Published at the start of a track, with or without subscribers.
 STARTS = ['body', 'human_description']
 CONFIG = ROOT / 'hmt_ros' / 'config' / 'filter_node.yaml'
 
@@ -60,7 +60,7 @@ def published(handled):
 
 @pytest.fixture
 def held_estimate(stub_tracker, monkeypatch, world):
-    """Two events: an estimate has begun, and estimates may go on."""
+    """Two events: an estimate has begun, and estimates are allowed to continue."""
     begun, go = threading.Event(), threading.Event()
     step = stub_tracker.step
 
@@ -86,20 +86,20 @@ def test_images_become_messages(running, small_camera):
     first = running.send('image', small_camera.image(0))
     assert first.source == 'image'
     assert first.stamp_ns == small_camera.stamp(0)
-    # What nobody listens to is not made.
+    # Topics without subscribers are not produced.
     assert published(first) == [*STARTS, 'pose_mixture', '/tf']
     assert published(running.send('image', small_camera.image(1))) == ['pose_mixture', '/tf']
     running.spin_until(lambda: len(mixtures) == 2 and len(transforms) == 2)
     assert [len(m.components) for m in mixtures] == [2, 2]
     assert mixtures[0].header.frame_id == 'lens'
     assert transforms[0].transforms[0].header.frame_id == 'lens'
-    # The body waits for those who come late.
+    # The body is latched for late subscribers.
     late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     running.listen(Body, 'body', bodies, late)
     running.listen(String, 'human_description', descriptions, late)
     running.spin_until(lambda: len(bodies) == len(descriptions) == 1)
     assert bodies[0].name == 'human37'
-    # The URDF has its place in the namespace of the person, and never that of the robot.
+    # The URDF is published in the person's namespace, never as the robot's.
     robot = ET.fromstring(descriptions[0].data)
     links = {link.attrib['name'] for link in robot.findall('link')}
     assert links - {'lens'} == {t.child_frame_id for t in transforms[1].transforms}
@@ -148,7 +148,7 @@ def test_wrong_values_are_refused_with_a_reason(running):
         ({'max_hypotheses': 0}, 'out of range. Min: 1, Max: 64, value: 0'),
         ({'subject_file': 'none.yaml'}, 'none.yaml: no such file'),
         ({'background_file': 'two\nlines'}, 'two lines: no such file'),
-        ({'body_model': 'nobody'}, 'nobody: no such file, and no name; there are human32'),
+        ({'body_model': 'nobody'}, 'nobody: no such file, nor a known name; these are human32'),
         ({'autostart': False}, 'read-only'),
         ({'max_hypotheses': 8.0}, 'type'),
     )
@@ -253,7 +253,7 @@ def test_lifecycle(world, small_camera):
     one.spin_until(lambda: one.publishers['image'].get_subscription_count() == 0)
     assert one.change_state('activate')
     one.connect()
-    # The track and the camera are those of before.
+    # Track and camera have not changed.
     assert faults(one.send('image', small_camera.image(1))) == []
     assert one.session.state.counts['tracked'] == 2
     assert one.change_state('deactivate')
@@ -273,7 +273,7 @@ def test_node_without_its_subject_lives(world, subject_file, small_camera):
     assert one.state == 'unconfigured'
     one.spin_until(lambda: len(one.warnings()) == 1)
     assert one.warnings() == [
-        f'subject_file: {missing}: can not be read (No such file or directory); mend that, '
+        f'subject_file: {missing}: can not be read (No such file or directory); fix that, '
         'then: ros2 lifecycle set /filter_node configure; ros2 lifecycle set /filter_node activate'
     ]
     assert one.diagnosis()[:2] == (2, one.warnings()[0])
@@ -352,7 +352,7 @@ def test_late_node_drops_the_oldest_and_answers_meanwhile(
     stamps = [stamp for stamp, _ in stub_tracker.made[0].seen]
     assert stamps == [small_camera.stamp(index) for index in (0, 10, 11)]
     assert one.session.state.counts == {'received': 12, 'tracked': 3, 'dropped': 9}
-    # Every image is answered, those that were dropped by their stamps.
+    # Every image is answered, dropped ones with their timestamps.
     one.spin_until(lambda: sum(h.source == 'image' for h in one.handled) == 12)
     dropped = [h for h in one.handled if h.source == 'image' and h.faults]
     assert [h.stamp_ns for h in dropped] == [small_camera.stamp(i) for i in range(1, 10)]
@@ -412,11 +412,11 @@ def test_diagnostics(running, small_camera):
     level, message, values = running.diagnosis()
     assert (level, message) == (1, 'waits for a calibrated camera_info')
     assert values['lifecycle'] == 'active'
-    # Before an image names the frame of the camera, its topic tells which it is.
+    # Until an image names the camera frame, the topic identifies the camera.
     assert running.diagnostics[-1].status[0].hardware_id == '/image'
     running.send('camera_info', small_camera.info())
     running.send('image', small_camera.image(0))
-    # Told at once, when the status changes.
+    # Published at once when the status changes.
     running.spin_until(lambda: running.diagnostics[-1].status[0].message == 'tracking, 2 modes')
     _, _, values = running.diagnosis()
     assert running.diagnostics[-1].status[0].name == 'filter_node: track'
@@ -473,7 +473,7 @@ def test_robots_are_told_that_no_image_is_answered(world, small_camera):
     # It grows.
     assert told[-1].unseen > told[-2].unseen >= 0.3
     assert min(told[-1].radii) > min(told[-2].radii)
-    # Where the person is by now.
+    # A forecast for the current time.
     answer = one.call(ForecastPose, 'forecast_pose', stamp=Time())
     assert not answer.success
     assert 'wanted a time from then to 10 s later' in answer.message

@@ -1,4 +1,4 @@
-"""Gravity over DDS: the filter node hears /tf and /tf_static, on which it publishes itself."""
+"""Gravity over DDS: the filter node subscribes to /tf and /tf_static and publishes on /tf."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def test_gravity_of_a_frame(world, small_camera, stub_tracker):
     one.start()
     one.spin_until(lambda: one.is_heard('ground'))
     one.send('camera_info', small_camera.info())
-    # A static mount, sent once and kept for those who come late, and a robot that stands.
+    # A static mount, sent once and latched, and a robot that stands still.
     one.send('tf_static', camera_place(0, 'robot'))
     for index in range(3):
         place = transforms_message(
@@ -67,7 +67,7 @@ def test_gravity_of_a_frame(world, small_camera, stub_tracker):
     (tracker,) = stub_tracker.made
     assert np.isclose(tracker.known_ground.camera_height, 1.7)
     assert len(tracker.gravities) == 2
-    # What the node itself publishes on /tf is no input.
+    # The node does not use its own messages on /tf.
     sources = [handled.source for handled in one.handled]
     assert sources == ['camera_info', 'tf_static', *['tf', 'image'] * 3]
     assert one.session.state.faults == {}

@@ -1,4 +1,4 @@
-"""The node that speaks REP 155, over DDS, where hri_msgs is installed."""
+"""The node for REP 155, over DDS, if hri_msgs is installed."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_people_come_and_go(installed, world_of, small_camera, likelihoods):
     one.listen(IdsList, '/humans/bodies/tracked', ids, latched)
     one.listen(TFMessage, '/tf', frames)
     one.send('camera_info', small_camera.info(0))
-    # Somebody comes whom nobody has announced.
+    # An unannounced person appears.
     one.publishers[TOPIC] = one.other.create_publisher(PoseMixtureMessage, TOPIC, 100)
     one.spin_until(one.publishers[TOPIC].get_subscription_count, 'a subscription')
     source = f'pose_mixture of {TOPIC.rpartition("/")[0]}'
@@ -96,7 +96,7 @@ def test_people_come_and_go(installed, world_of, small_camera, likelihoods):
     assert values['bodies'] == 'p1_1'
     assert values['mixtures converted'] == '2'
 
-    # Another track is another body; the topics of the first one go.
+    # Another track is another body; the topics of the first one disappear.
     one.send(source, mixture(likelihoods, 2, track=2), TOPIC)
     one.spin_until(lambda: list(ids[-1].ids) == ['p1_2'])
     one.spin_until(lambda: one.other.count_publishers('/humans/bodies/p1_1/roi') == 0)
@@ -108,7 +108,7 @@ def test_people_come_and_go(installed, world_of, small_camera, likelihoods):
     one.spin_until(one.publishers[TOPIC].get_subscription_count, 'a subscription')
     one.send(source, mixture(likelihoods, 4, 3), TOPIC)
     one.spin_until(lambda: list(ids[-1].ids) == ['p1_3'])
-    # Who deactivates the node does not leave bodies behind.
+    # Deactivating the node removes all bodies.
     assert one.change_state('deactivate')
     one.spin_until(lambda: not len(ids[-1].ids))
     assert one.change_state('cleanup')

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.ros
 
 @pytest.fixture
 def world(stub_tracker, subject_file, world_of):
-    """A world with a filter, whose calibration has come."""
+    """A world with a filter that has received its calibration."""
 
     def make(camera, source, **values):
         from sensor_msgs.msg import CameraInfo, Image
@@ -38,7 +38,7 @@ def world(stub_tracker, subject_file, world_of):
 
 
 def tracked(one, message, camera, index, stub_tracker):
-    """The keypoints that reach the tracker with an image."""
+    """The keypoints that the tracker receives with an image."""
     count = len(one.handled)
     one.publishers['detections'].publish(message)
     one.spin_until(lambda: len(one.handled) > count, 'an answer')

@@ -1,4 +1,4 @@
-"""The keypoints node itself, over DDS, with a stand-in and with MediaPipe."""
+"""The keypoints node over DDS, with a stub detector and with MediaPipe."""
 
 import os
 import sys
@@ -76,7 +76,7 @@ def test_without_a_detector_one_line_says_what_to_do(world, monkeypatch):
 
 
 def test_mediapipe_pose_itself(world, mediapipe_pose):
-    """It finds in images of the topic what MediaPipe found when the clip was made."""
+    """In images of the topic it finds the same as MediaPipe when the clip was made."""
     if not CLIP.is_dir():
         pytest.skip(f'no development clip in {CLIP} (set HMT_SHARED)')
     with np.load(CLIP / 'keypoints_mediapipe.npz') as file:

@@ -1,4 +1,4 @@
-"""Files that peers name by parameters: nothing of their content comes back, and a node lives on."""
+"""Files named by peers in parameters: their content is not revealed, and the node survives."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ KINDS = {
 
 
 def secrets(folder):
-    """Files of many kinds, all with the tokens."""
+    """Files of many kinds that contain the tokens."""
     secret, number, hidden = TOKENS
     texts = {
         'shadow': f'root:{secret}:0:0\ndaemon:*:{number}:{hidden}\n',
@@ -96,7 +96,7 @@ def test_no_content_of_a_file_of_the_launch_is_told(node_of, name, tmp_path):
     assert not one.change_state('configure')
     (text,) = one.warnings()
     assert f'{parameter}: {file}: not a ' in text
-    assert '; mend that, then: ros2 lifecycle set' in text
+    assert '; fix that, then: ros2 lifecycle set' in text
     level, message, _ = one.diagnosis()
     assert (level, message) == (2, text)
     assert not [token for token in TOKENS if token in one.logged]
@@ -121,7 +121,7 @@ def test_files_elsewhere_are_refused_whether_or_not_they_exist(
         'subject_file: PATH lies in no folder of file_folders, which are allowed: move it '
         'there, or name it at launch'
     }
-    # Named at launch: read, though it is no picture.
+    # A file named at launch is read, although it is not an image.
     good, reason = one.set(subject_file='')
     assert 'background_file: outside.yaml: not a PNG or JPEG image' in reason
     assert one.set(background_file='')[0]
@@ -182,7 +182,7 @@ def test_a_slow_reader_is_not_waited_for():
     assert text == 'the files are still being read: ask again later'
     assert first == pytest.approx(patient_reader.LONGEST_WAIT, abs=0.2)
     assert len(turns) > 10
-    # Its time is used up: nobody is kept waiting by many questions.
+    # The time for checks is used up, so many requests do not block others.
     began = time.monotonic()
     for _ in range(100):
         assert 'other files' in ask('b')[0]

@@ -1,4 +1,4 @@
-"""Parameters that are given in vain are named, and so are files for another node."""
+"""Unused parameters are named, and so are files for another node."""
 
 from functools import partial
 
@@ -40,7 +40,7 @@ def test_unknown_names_from_command_line_and_file(world_of, stub_tracker, tmp_pa
         ('filter_node', False),
         ('/**', False),
         ('/*', False),
-        # Another node of ours, or one of others: the file is for several.
+        # Nodes of this or another package: the file is for several nodes.
         ('smoother_node', False),
         ('/camera/driver', False),
     ],

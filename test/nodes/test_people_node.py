@@ -1,4 +1,4 @@
-"""The node of several people itself, over DDS."""
+"""The node for several people, over DDS."""
 
 from importlib.util import find_spec
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.ros
 
 @pytest.fixture
 def world(world_of, monkeypatch):
-    """A world with the node, whose trackers cost nothing, and what it publishes of people."""
+    """A world with the node and stub trackers, and its messages about people."""
     from hmt_msgs.msg import People2D, PoseMixture
     from sensor_msgs.msg import CameraInfo, Image
 
@@ -43,7 +43,7 @@ def world(world_of, monkeypatch):
 
 
 def show(one, camera, index, *people):
-    """An image and its detections, after which the list of people has come."""
+    """Sends an image and its detections, and waits for the list of people."""
     count = len(one.found)
     one.send('detections', seen(camera, index, *people))
     handled = one.send('image', camera.image(index))
@@ -78,7 +78,7 @@ def test_topics_come_and_go_with_the_people(world, small_camera):
 
 
 def test_a_detector_that_is_killed_and_started_again(world, small_camera):
-    """Images without detections are named as such, and the person is the same afterwards."""
+    """Images without detections are reported, and the person is the same afterwards."""
     one = world(small_camera)
     show(one, small_camera, 0, somebody_at(15, 'anna'))
     one.spin_until(lambda: one.is_heard('humans/bodies/anna/pose_mixture'))
@@ -98,7 +98,7 @@ def test_reset_drops_all_tracks(world, small_camera):
     one = world(small_camera)
     show(one, small_camera, 0, somebody_at(15, 'anna'))
     answer = one.call(Reset, 'reset', box=RegionOfInterest(width=5, height=5))
-    assert (answer.success, answer.message[:26]) == (False, 'a mixture or a box is of o')
+    assert (answer.success, answer.message[:26]) == (False, 'a mixture or a box is for ')
     answer = one.call(Reset, 'reset')
     assert (answer.success, answer.message) == (True, 'a new track waits for detections of people')
     show(one, small_camera, 1, somebody_at(15, 'anna'))

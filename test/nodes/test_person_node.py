@@ -1,4 +1,4 @@
-"""Nodes in one process: the same topics and bytes, without the way through DDS."""
+"""Nodes in one process: the same topics and bytes, without DDS in between."""
 
 import signal
 import subprocess
@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def together(stub_tracker, stub_predictor, background_file):
-    """Filter, smoother and experts of one process, an executor, and somebody who talks to them."""
+    """Filter, smoother and experts of one process, an executor, and a node that talks to them."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.parameter import Parameter
@@ -67,12 +67,12 @@ def state_of(node):
 
 
 def subscribed(node):
-    """Topics that a node gets over DDS."""
+    """Topics that a node receives over DDS."""
     return {one.topic_name for one in node.subscriptions}
 
 
 def camera_of(other, executor):
-    """Publishers of a camera, once the image comes in, whatever number of nodes wants it."""
+    """Publishers of a camera, once the nodes' image subscription is connected."""
     from sensor_msgs.msg import CameraInfo, Image
 
     publishers = {
@@ -94,7 +94,7 @@ def test_what_one_publishes_the_next_gets_without_dds(together, small_camera):
     came = []
     other.create_subscription(PoseMixture, 'pose_mixture', came.append, 100)
     publishers = camera_of(other, executor)
-    # Predictions do not come in at all.
+    # Nobody subscribes to predictions over DDS.
     assert other.count_subscribers(PREDICTION) == 0
     assert other.count_subscribers('likelihood_mixture') == 0
     spin_until(executor, lambda: other.count_publishers('pose_mixture') == 1, 'a publisher')
@@ -118,7 +118,7 @@ def test_what_one_publishes_the_next_gets_without_dds(together, small_camera):
 
 
 def in_lock_step(together, small_camera, kinds, count=6):
-    """Bytes by topic of images in one process, and of the sessions by themselves, bytes between."""
+    """Bytes by topic from nodes in one process, and from separate sessions linked by bytes."""
     from importlib import import_module
 
     nodes, other, executor = together()
@@ -144,7 +144,7 @@ def in_lock_step(together, small_camera, kinds, count=6):
             lambda n=index: state_of(nodes['smoother_node']).counts['smoothed'] > n,
             'smoothing',
         )
-        # The experts have heard of the track.
+        # The experts have received the track.
         spin_until(executor, lambda: not len(bme_node._estimator.queue), 'the track')
     nodes['smoother_node'].trigger_deactivate()
     spin_until(executor, lambda: len(came['smoothed_pose_mixture']) == count, 'the end')
@@ -153,7 +153,7 @@ def in_lock_step(together, small_camera, kinds, count=6):
 
 
 def test_the_bytes_are_those_of_nodes_in_processes_of_their_own(together, small_camera):
-    """What is handed on as it is and what went through bytes leads to the same."""
+    """Objects passed directly and serialised messages have the same results."""
     from hmt_ros.nodes.person_node import NODES
     from msg_tools.messages.cdr import deserialise
 
@@ -186,7 +186,7 @@ def test_the_bytes_are_those_of_nodes_in_processes_of_their_own(together, small_
     sessions['smoother_node'].finish()
     assert [len(made[topic]) for topic in names] == [count] * 3
     for topic, own in made.items():
-        # The middleware may pad the end.
+        # The middleware is allowed to pad the end.
         pairs = zip(came[topic], own, strict=True)
         assert [data[: len(each)] for data, each in pairs] == own
 
@@ -229,7 +229,7 @@ def test_a_node_that_is_deactivated_leaves_the_images_to_the_others(together, sm
 
 
 def run(*words, stop_at=''):
-    """Runs the executable, up to a text if one is given; its exit code and output."""
+    """Runs the executable, up to a text if given; returns its exit code and output."""
     process = subprocess.Popen(
         [sys.executable, '-m', 'hmt_ros.nodes.person_node', *words],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,

@@ -1,4 +1,4 @@
-"""Windows refined on images, where filter and smoother share a process, and where they do not."""
+"""Windows refined on images, with filter and smoother in the same or different processes."""
 
 import pytest
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.ros
 
 
 def seen(tracker):
-    """An image that shows nothing: the prior of the body alone."""
+    """An image without evidence: only the prior of the body."""
     return SeenImage(ImageLikelihood(tracker.body, tracker.camera), Observation())
 
 

@@ -1,4 +1,4 @@
-"""A node ends with its owner, and what is no model is refused."""
+"""A node ends with its owner, and files that are no models are refused."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ MODEL = ROOT / 'hmt_ros' / 'experts' / 'models' / 'silhouettes.npz'
 
 @pytest.mark.ros
 def test_a_node_does_not_outlive_its_owner(monkeypatch, executable):
-    # Process 1 has not started it.
+    # Process 1 is not its parent.
     monkeypatch.setenv('HMT_ROS_OWNER', '1')
     node = executable('smoother_node', '-p', 'autostart:=false')
     node.process.communicate(timeout=60.0)

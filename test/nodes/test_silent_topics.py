@@ -1,4 +1,4 @@
-"""What a node says of topics on which nothing arrives: who publishes, and what there is."""
+"""Reports of a node on silent topics: their publishers, and alternatives."""
 
 import re
 import time
@@ -11,7 +11,7 @@ RAW, JPEG, INFO = (f'sensor_msgs/msg/{name}' for name in ('Image', 'CompressedIm
 
 
 def silent(transport, *published, name='/image'):
-    """Why nothing arrives where others publish (topic, type)."""
+    """The reason for silence, given published (topic, type) pairs."""
     from hmt_ros.nodes.silent_topics import Publication, why_silent
     from hmt_ros.nodes.subscribed_topic import image_topic
 
@@ -70,7 +70,7 @@ def test_the_reason_and_what_there_is_instead(transport, published, end):
 
 @pytest.fixture
 def world(stub_tracker, subject_file, world_of):
-    """A filter to which nobody publishes, and the warnings that a topic is named in."""
+    """A filter without publishers, and the warnings that name a topic."""
     from hmt_ros.nodes.filter_node import FilterNode
 
     def make(inputs=(), **values):
@@ -98,13 +98,13 @@ def test_nobody_publishes(world):
     hint = re.compile(r'there (is|are) .*/camera/image_raw \(sensor_msgs/Image\).*: remap with -r ')
     one.spin_until(lambda: any(map(hint.search, of_topic(one, '/image'))), 'the hint')
     one.spin_until(lambda: of_topic(one, '/camera_info'), 'the other hint')
-    # In the diagnostics, too, by topic and as the reason.
+    # The diagnostics also contain it, by topic and as the reason.
     level, message, values = one.diagnosis()
     assert level == 1
     assert message.startswith('waits for a calibrated camera_info; nothing on /image (')
     assert 'nothing on /camera_info (sensor_msgs/CameraInfo); nobody publishes it' in message
     assert values['nothing on /image'] in of_topic(one, '/image')
-    # Again only after a while.
+    # It is repeated only after some time.
     count = len(of_topic(one, '/image'))
     for _ in range(3):
         one.diagnosis()
@@ -117,7 +117,7 @@ def test_what_arrives_is_not_told(world, small_camera):
     one.own_periods()
     one.send('camera_info', small_camera.info())
     one.send('image', small_camera.image(0))
-    # It has listened for long, and the calibration, which is needed once, came long ago.
+    # It has listened for a long time, and has the calibration, which is needed only once.
     silent, long_ago = one.node._silent, time.monotonic() - 1e4
     silent._began = long_ago
     for source in ('camera_info', 'image'):

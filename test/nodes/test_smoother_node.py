@@ -85,7 +85,7 @@ def test_parameters_are_those_of_the_file(running):
     running.assert_refused(
         ({'fixed_lag': -1.0}, 'out of range'),
         ({'max_hypotheses': 0}, 'out of range'),
-        ({'body_model': 'nobody'}, 'nobody: no such file, and no name; there are human32'),
+        ({'body_model': 'nobody'}, 'nobody: no such file, nor a known name; these are human32'),
         ({'autostart': False}, 'read-only'),
     )
     assert running.set(queue_size=3, max_hypotheses=2) == (True, '')
@@ -110,7 +110,7 @@ def test_windows_are_smoothed_on_demand(running, likelihoods, monkeypatch):
     found = answer.trajectories
     assert [time_ns(stamp) for stamp in found.stamps] == [likelihoods.stamp(i) for i in (1, 2, 3)]
     assert len(found.components[0].marginal_covariances) == 3 * 37 * 37
-    # What comes meanwhile waits, and none is lost.
+    # Messages that arrive meanwhile wait, and none is lost.
     smooth_span, count = SmootherSession.smooth_span, len(running.handled)
 
     def slow(self, *span):
@@ -141,7 +141,7 @@ def test_a_node_lives_on_after_values_that_are_no_numbers(running, likelihoods):
 
 
 def test_queue_holds_what_was_published(running, likelihoods):
-    """Mixtures that come while one is smoothed wait."""
+    """Mixtures that arrive during smoothing wait."""
     data = serialise(likelihoods.message(0))
     count = len(running.handled)
     running.receive('likelihood_mixture', data[:60])

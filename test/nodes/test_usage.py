@@ -1,4 +1,4 @@
-"""Each node explains itself: usage and all parameters, wherever --help stands."""
+"""Each node prints its usage and all parameters, wherever --help stands."""
 
 import re
 from pathlib import Path
@@ -9,14 +9,14 @@ pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parents[2]
 NODES = [path.stem for path in sorted((ROOT / 'hmt_ros' / 'nodes').glob('*_node.py'))]
-# A way to run nodes, what some have in common, a process of several, and a driver with arguments.
+# Helper modules, a process of several nodes, and a driver with arguments.
 OTHERS = ('run_node', 'session_node', 'tracking_node', 'person_node', 'camera_node')
 NODES = [name for name in NODES if name not in OTHERS]
 
 
 @pytest.fixture
 def helped(ended):
-    """What a node says of itself."""
+    """The help text of a node."""
 
     def help_of(node, *arguments):
         code, output, errors = ended(node, *arguments)
@@ -59,7 +59,7 @@ def test_help_lists_usage_and_all_parameters(node, helped):
 def test_bad_arguments_are_one_line(node, arguments, ended):
     code, output, errors = ended(node, 'video.mp4', '--ros-args', *arguments)
     assert (code, output) == (1, '')
-    # rcl prints lines of its own, which begin with their time.
+    # rcl prints further lines, which begin with their time.
     (line,) = (x for x in errors.splitlines() if x.startswith(f'{node}: '))
     assert len(line) <= 300
     assert line.isprintable()

@@ -30,7 +30,7 @@ def true_log_density(inputs, targets):
 
 
 def styles(count, seed, inputs=20, outputs=32):
-    """A synthetic motion: inputs (N, p) that hardly distinguish two styles, and targets (N, D)."""
+    """A synthetic motion: inputs (N, p) that barely distinguish two styles, targets (N, D)."""
     shape = np.random.default_rng(0)
     into = shape.normal(size=(6, inputs))
     out = shape.normal(size=(8, outputs))

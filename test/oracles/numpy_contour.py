@@ -1,4 +1,4 @@
-"""Occluding contours in vectorised numpy, as `hmt_ros.image.surface` compiles them."""
+"""Occluding contours in vectorised numpy, the reference of `hmt_ros.image.surface`."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class Contour:
     """Occluding contour of the flesh for N poses: two points on each of R rings.
 
     Attributes:
-        segments, parts: (2R,) of each point.
-        local: (2R, 3, N) places in the frames of the segments, m.
+        segments, parts: (2R,) segment and part of each point.
+        local: (2R, 3, N) positions in the frames of the segments, m.
         points: (2R, 3, N) camera frame, m.
         normals: (2R, 3, N) outward unit normals, camera frame; perpendicular to the ray.
-        exists: (2R, N) false where a ring is seen from its end and has no contour.
+        exists: (2R, N) false if a ring is seen from its end and has no contour.
         turns: (2R, 2, N) cosine and sine of the angle around the ring.
     """
 
@@ -91,7 +91,7 @@ def occluding_contour(flesh: Flesh, frames: Frames) -> Contour:
 def _bracketed_angles(
     big_u: Array, uz: Array, slopes: Array, exponent: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """The two roots w (2, R, N) of g, and where there are two, by bracketing and false position."""
+    """The two roots w (2, R, N) of g and their existence, by bracketing and false position."""
     power = (2.0 - exponent)[:, None]
     kx, ky = slopes.T[:, :, None]
 

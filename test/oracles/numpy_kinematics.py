@@ -37,8 +37,8 @@ def segment_sums(
     """Sums of g b and k b b^T per segment, for residuals at points that stay on their segments.
 
     Args:
-        segments: (M,) the segment of each residual.
-        points: (M, 3, N) where it acts, camera frame, m.
+        segments: (M,) segment of each residual.
+        points: (M, 3, N) point of each residual, camera frame, m.
         directions: (M, 3, N) derivative a of the residual with respect to its point.
         pull: (M, N) derivative g of the energy with respect to the residual.
         curvature: (M, N) second derivative k, not negative.
@@ -64,7 +64,7 @@ def assemble(frames: Frames, wrenches: Array, stiffnesses: Array) -> tuple[Array
     """Gradient (N, d) and Gauss-Newton Hessian (N, d, d) from sums over the points of each segment.
 
     Args:
-        frames: of the poses.
+        frames: frames of the poses.
         wrenches: (S, 6, N) sum of g b.
         stiffnesses: (S, 6, 6, N) sum of k b b^T, symmetric.
     """

@@ -1,8 +1,7 @@
-"""The likelihood of an image in vectorised numpy: what the compiled kernels are measured against.
+"""The likelihood of an image in vectorised numpy, the reference of the compiled kernels.
 
-Written from the same equations as `hmt_ros.image`, with the batch of poses on the last axis and
-matrix products where there are any. It serves twice: `python -m benchmarks kernels` compares the
-time, and the tests compare values, gradients and Hessians.
+It implements the same equations as `hmt_ros.image`, with the batch of poses on the last axis and
+matrix products if possible. Tests compare values, gradients and Hessians.
 """
 
 from __future__ import annotations
@@ -73,7 +72,7 @@ def image_energies(
     poses: Array,
     observation: Observation,
 ) -> dict[str, Energy]:
-    """The terms of the image, by name; arguments as `ImageLikelihood.energies`."""
+    """The image terms by name; arguments as for `ImageLikelihood.energies`."""
     frames = forward(likelihood.body.skeleton, poses)
     found = _terms(likelihood, frames, observation)
     return {name: _assembled(frames, [term]) for name, term in found.items()}
@@ -84,7 +83,7 @@ def image_energy(
     poses: Array,
     observation: Observation,
 ) -> Energy:
-    """Their sum, assembled once."""
+    """The sum of the image terms, assembled once."""
     frames = forward(likelihood.body.skeleton, poses)
     found = _terms(likelihood, frames, observation)
     return _assembled(frames, list(found.values()))
@@ -131,7 +130,7 @@ def _assembled(frames: Frames, terms: list[Residuals]) -> Energy:
 
 
 def _scattered_sums(term: Residuals, count: int) -> tuple[Array, Array]:
-    """`segment_sums` where the segment of a residual differs from pose to pose."""
+    """`segment_sums` for residuals whose segments differ between poses."""
     n = term.points.shape[-1]
     a, p = term.directions, term.points
     b = np.concatenate([a, np.cross(p, a, axis=1)], axis=1).transpose(0, 2, 1)  # (M, N, 6)
@@ -178,7 +177,7 @@ def sample(image_map: ImageMap, pixels: Array, channels: Index | int = 0) -> tup
 def sample_distance(
     image_map: ImageMap, pixels: Array, channels: Index | int = 0
 ) -> tuple[Array, Array]:
-    """`sample` of a map of distances, continued outside by the way to the window."""
+    """`sample` of a distance map, extended outside by the distance to the window."""
     value, gradient = sample(image_map, pixels, channels)
     _, h, w = image_map.values.shape
     for axis, (first, size) in enumerate(((image_map.left, w), (image_map.top, h))):
@@ -193,7 +192,7 @@ class Surface:
     """Occluding contours of N poses in the image: P points.
 
     Attributes:
-        segments: (P,).
+        segments: (P,) segment of each point.
         points: (P, 3, N) camera frame, m.
         pixels, projection, normals: (2, P, N), (2, 3, P, N), (2, P, N).
         valid, covered, hidden, noise: (P, N), see `hmt_ros.image.surface.Contour`.
@@ -228,7 +227,7 @@ def project_surface(body: Body, camera: Camera, frames: Frames) -> Surface:
 
 
 def visibility(body: Body, frames: Frames, points: Array, parts: Index) -> tuple[Mask, Mask]:
-    """Whether other parts lie on the rays to points (P, 3, N), and whether before them; (P, N)."""
+    """Whether other parts lie on the rays to points (P, 3, N), and in front of them; (P, N)."""
     flesh = body.flesh
     segments = np.array([part.segment for part in flesh.parts])
     radii = COVER * np.array([part.radii for part in flesh.parts])
@@ -244,7 +243,7 @@ def visibility(body: Body, frames: Frames, points: Array, parts: Index) -> tuple
     discriminant = mk * mk - mm * ((k * k).sum(2) - 1.0)[:, :, None]
     through = (discriminant > 0) & (np.arange(count)[:, None] != parts)
     root = np.sqrt(np.maximum(discriminant, 0.0))
-    through &= mk + root > 0.0  # what is behind the camera covers nothing
+    through &= mk + root > 0.0  # parts behind the camera cover nothing
     before = through & (mk - root < (1.0 - BEHIND) * mm)
     return through.any(1).T, before.any(1).T
 
@@ -254,7 +253,7 @@ def coverage(
 ) -> Residuals:
     """Points on the outline pay their distance to the nearest contour of the model.
 
-    `factors` (P,) are those of the points of the contour.
+    `factors` (P,) are the factors of the contour points.
     """
     match = nearest_contour_points(surface, outline)  # (M, N)
     batch = np.arange(match.shape[1])
@@ -264,10 +263,10 @@ def coverage(
     across = (nx * offset[0] + ny * offset[1]) / sigma
     along = nx * offset[1] - ny * offset[0]
     beyond = np.sign(along) * np.maximum(np.abs(along) - OUTLINE_SPACING, 0.0) / sigma
-    # One kernel on the length of the two residuals together.
+    # One kernel is applied to the norm of the two residuals.
     each = term.weight / max(len(match), 1)
     rho, _, curvature = geman_mcclure(np.hypot(across, beyond), term.scale, each * factors[match])
-    # Where nothing of the body is before the camera every sample costs all that it can.
+    # If the whole body is behind the camera, every sample has its maximum cost.
     seen = surface.valid.any(0)
     rho = np.where(seen, rho, 0.5 * each * term.scale**2)
     curvature = np.where(seen, curvature, 0.0)
@@ -301,7 +300,7 @@ def nearest_contour_points(surface: Surface, outline: Outline) -> Index:
         axis=1,
     )
     use = surface.valid & ~surface.covered
-    # A pose whose contour is covered everywhere keeps all that exists.
+    # A pose with a fully covered contour uses all existing points.
     use |= surface.valid & ~use.any(0)
     u = np.where(use, surface.pixels - centre[:, None, None], 0.0)
     square = np.where(use, u[0] * u[0] + u[1] * u[1], 1e12)
@@ -330,7 +329,7 @@ def flow_energy(
     frames: Frames, camera: Camera, points: SurfacePoints, which: Index, flow: ImageMap,
     weight: float,
 ) -> Energy:  # fmt: skip
-    """Where poses, which have rows (N,) of the points, move them against the optical flow."""
+    """Energy of the difference between the optical flow and the motion of points (rows (N,))."""
     segments = points.segments[which].T  # (Q, N)
     local = points.local[which].transpose(1, 2, 0)
     batch = np.arange(frames.count)
@@ -359,7 +358,7 @@ def _pairs(
     rho: Array, segments: Index, points: Array, along: Array, across: Array, first: Array,
     second: Array, curvature: Array,
 ) -> Residuals:  # fmt: skip
-    """Two residuals a point, whose derivatives (3, Q, N) are given."""
+    """Two residuals per point, with given derivatives (3, Q, N)."""
     return Residuals(
         rho.sum(0),
         np.tile(segments, (2, 1)),

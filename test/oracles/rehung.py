@@ -1,4 +1,4 @@
-"""Limbs that hang on another trunk, and keep the image that they had or take that of another."""
+"""Limbs moved to another trunk that keep their image or take that of another limb."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from hmt_ros.flips.chain_links import chain_links
 
 
 def rehang_chain(body, poses, new_poses, chain, *, image_of=None, slack=0.1):
-    """Poses whose chain hangs on another trunk and still has the image that it had.
+    """Poses whose chain is moved to another trunk and still has the same image.
 
-    Its joints are put back onto the rays through their images, in all ways that lengths and limits
+    Its joints are placed on the rays through their images, in all ways that lengths and limits
     allow.
 
     Args:
         body: the body.
-        poses: (N, d) that have the image.
-        new_poses: (N, d) with the other trunk.
+        poses: poses (N, d) with the image.
+        new_poses: poses (N, d) with the other trunk.
         chain: name of the chain.
-        image_of: name of the chain whose image is taken; None: the chain itself.
+        image_of: name of the chain whose image is used; None: the chain itself.
         slack: a ray that misses its sphere by less than this touches it, m.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Energies of terms by themselves, which tests compare with formulas and sums with."""
+"""Energies of single terms, which tests compare with formulas and with sums."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def energy_of(
     camera: Camera = CAMERA,
     derivatives: Derivatives = Derivatives.POSITIVE,
 ) -> Energy:
-    """The energy of a term at poses (N, d) of a body; without rows each is a problem of its own."""
+    """The energy of a term at poses (N, d) of a body; without rows, each is its own problem."""
     one = OneByOne(ImageLikelihood(body, camera), (term,))
     return one.energy(np.atleast_2d(poses), rows, derivatives=derivatives)
 
@@ -58,6 +58,6 @@ def image_energy(
     observation: Observation,
     derivatives: Derivatives = Derivatives.POSITIVE,
 ) -> Energy:
-    """The energy of the image terms alone at poses (N, d)."""
+    """The energy of only the image terms at poses (N, d)."""
     image = ObservedImage(likelihood, observation)
     return PoseEnergy(likelihood, (image,)).energy(poses, derivatives=derivatives)

@@ -1,4 +1,4 @@
-"""A tracker and a predictor that cost nothing, messages of a camera and of a filter."""
+"""Stub tracker and stub predictor, messages of a camera and of a filter."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ JOINTS = ('left_hip', 'right_hip', 'left_shoulder', 'right_shoulder', 'head')
 
 
 class StubTracker:
-    """What `hmt_ros.tracking.Tracker` shows to the outside; its two modes are where it was told."""
+    """Stub with the interface of `hmt_ros.tracking.Tracker` and two given modes."""
 
     made: list[StubTracker] = []  # noqa: RUF012
     empty: set[int] = set()  # noqa: RUF012  # stamps of images without a person
@@ -97,7 +97,7 @@ class StubTracker:
 
     @property
     def estimate(self):
-        """It is its own estimate."""
+        """The tracker itself, which stands for its estimate."""
         return self
 
     @property
@@ -111,7 +111,7 @@ class StubTracker:
 
     @property
     def forecaster(self):
-        """To the right by 1 m/s."""
+        """Moves the person to the right at 1 m/s."""
         stamp, before = self.seen[-1][0], self.posterior
 
         def at(later):
@@ -123,7 +123,7 @@ class StubTracker:
 
     @property
     def velocities(self):
-        """To the right, from the second image on."""
+        """To the right, from the second image."""
         moving = np.zeros((2, self.body.dimension))
         moving[:, 0] = [1.5, 0.0]
         return moving if len(self.seen) > 1 else None
@@ -178,7 +178,7 @@ def stub_tracker(monkeypatch):
 
 @dataclass
 class SmallCamera:
-    """Messages of a camera of 64x48 pixels; images are counted from 0, ten a second."""
+    """Messages of a camera of 64x48 pixels; images are counted from 0, ten per second."""
 
     camera: Camera = field(default_factory=lambda: Camera(60.0, 60.0, 31.5, 23.5, 64, 48))
     messages: RosbagsMessages = field(default_factory=RosbagsMessages)
@@ -199,7 +199,7 @@ class SmallCamera:
         return compressed_image_message(self.messages, picture, self.stamp(index), 'lens')
 
     def mask(self, index, size=(64, 48), fill=0, encoding='mono8'):
-        """A mask of one value, but for a person of 10x24 pixels."""
+        """A mask of one value, except for a person of 10x24 pixels."""
         pixels = np.full((size[1], size[0]), fill, np.uint8)
         pixels[12:36, 20:30] = 1
         message = image_message(self.messages, pixels, self.stamp(index), 'lens')
@@ -244,7 +244,7 @@ class SmallCamera:
         )
 
     def keypoints(self, index, names=JOINTS, **fields):
-        # At (0, 0) they would not be seen.
+        # At (0, 0) keypoints count as missing.
         fields.setdefault('u', np.arange(1.0, 1 + len(names)))
         fields.setdefault('v', np.arange(1.0, 1 + len(names)))
         return self.messages.create(
@@ -255,7 +255,7 @@ class SmallCamera:
         )
 
     def keypoints_3d(self, index, names=JOINTS, **fields):
-        """Landmark i is i m to the right."""
+        """3D landmarks; landmark i is i m to the right."""
         fields.setdefault('x', np.arange(len(names), dtype=float))
         return self.messages.create(
             'hmt_msgs/msg/Keypoints3D',
@@ -291,7 +291,7 @@ def somebody():
 
 
 class StubPredictor:
-    """What `hmt_ros.experts.PosePredictor` shows; its poses do not depend on the silhouette."""
+    """Stub of `hmt_ros.experts.PosePredictor`, whose poses do not depend on the silhouette."""
 
     body = load_body('human37')
     asked: list[tuple[Any, GaussianMixture | None, float]] = []  # noqa: RUF012
@@ -334,7 +334,7 @@ def stub_predictor(monkeypatch):
 
 @pytest.fixture
 def outputs():
-    """What a session publishes."""
+    """List of the messages that a session publishes."""
     return []
 
 
@@ -361,18 +361,18 @@ def background_file(tmp_path):
 
 @dataclass
 class Likelihoods:
-    """Messages of a filter whose person raises an arm; ten mixtures of two modes a second."""
+    """Messages of a filter whose person raises an arm; ten mixtures of two modes per second."""
 
     body: Body = field(default_factory=lambda: load_body('human37'))
     messages: RosbagsMessages = field(default_factory=RosbagsMessages)
     leans: bool = False
-    hops: float = 0.002  # probability that a mode continues the other one
+    hops: float = 0.002  # probability that a mode descends from the other one
 
     def stamp(self, index):
         return START_NS + round(index * FRAME_NS)
 
     def mixture(self, index):
-        """A mixture over poses; the second mode is an elbow that bends more, and may lean back."""
+        """A mixture over poses; the second mode bends the elbow more, and may lean back."""
         means = np.tile(self.body.prior_mean, (2, 1))
         means[:, 2] = 4.0
         moving = self.body.dof_names.index('left_elbow')
@@ -392,14 +392,14 @@ class Likelihoods:
         )
 
     def chain(self, weights, before):
-        """What a filter tells of modes that continue those of image `before`; None: they begin."""
+        """Ancestry of modes that continue those of image `before`; None for first modes."""
         count, known = len(weights), before is not None
         own = self.hops + (1.0 - count * self.hops) * np.eye(count)
         ids = np.arange(5, 5 + count)
         return {
             'identities': ids,
             'posterior_weights': np.array(weights),
-            # Columns may have any order.
+            # Columns have no fixed order.
             'ancestry': own[:, ::-1] if known else np.empty((count, 0)),
             'ancestry_ids': ids[::-1] if known else ids[:0],
             'ancestry_stamp_ns': self.stamp(before) if known else 0,
@@ -419,9 +419,9 @@ class Likelihoods:
         """A mixture as a message.
 
         Args:
-            weights: posterior weights of the modes; None: 0.7 and 0.3, or those of another mixture.
-            before: image whose modes they continue, by default the last one; None: they begin.
-            chain: whether the message tells both, as those of the filter do.
+            weights: posterior weights of the modes; None means 0.7 and 0.3, or those of `mixture`.
+            before: image whose modes they continue, by default the last one; None for a start.
+            chain: whether the message contains both, as those of the filter do.
         """
         body, found = body or self.body, mixture or self.mixture(index)
         if weights is None:
@@ -443,7 +443,7 @@ class Likelihoods:
 
 @pytest.fixture(scope='session')
 def random_walk():
-    """A motion prior of bodies whose poses walk randomly at their rates in the smoother."""
+    """Makes the smoother use random walks at the bodies' rates as motion priors."""
     return lambda body: LinearGaussianDynamics.random_walk(body.rates / smoother_session.LIVELINESS)
 
 
@@ -452,7 +452,7 @@ def likelihoods():
     return Likelihoods()
 
 
-# hri_msgs 2.0, as far as REP 155 is spoken here.
+# The part of hri_msgs 2.0 used for REP 155.
 HRI_MSGS = {
     'IdsList': 'std_msgs/Header header\nstring[] ids\n',
     'NormalizedPointOfInterest2D': 'float32 x\nfloat32 y\nfloat32 c\n',
@@ -466,7 +466,7 @@ HRI_MSGS = {
 
 @pytest.fixture(scope='session')
 def hri_msgs(tmp_path_factory):
-    """Makes the messages of hri_msgs known, which need not be installed."""
+    """Registers the messages of hri_msgs, which need not be installed."""
     folder = tmp_path_factory.mktemp('hri_msgs')
     for name, text in HRI_MSGS.items():
         (folder / f'{name}.msg').write_text(text)
@@ -475,5 +475,5 @@ def hri_msgs(tmp_path_factory):
 
 @pytest.fixture
 def few_wait(monkeypatch):
-    """Only `queue_size` images may wait for other inputs."""
+    """Limits the number of waiting images to `queue_size`."""
     monkeypatch.setattr(camera_session, 'MOST_INCOMPLETE', 1)

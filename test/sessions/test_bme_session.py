@@ -1,4 +1,4 @@
-"""The rules of the session, with a predictor that costs nothing."""
+"""The BME session, with a stub predictor."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ from msg_tools.messages.keypoints import keypoints_message
 from msg_tools.messages.pose_mixtures import MixtureKind, TrackState, pose_mixture_of
 
 FRAME_NS = 100_000_000
-# Images of a scene in which nothing moves that suffice.
+# Sufficient number of images of a static scene.
 STILL = 16
 
 
@@ -87,7 +87,7 @@ def test_nobody_is_a_prediction_without_components(session, outputs, somebody, s
 
 
 def test_background_is_learned_from_an_empty_scene(session, outputs, somebody):
-    """Somebody who is in view from the first image on is not taken for it."""
+    """A person in view from the first image is not learned as background."""
     one = session(background_file='')
     one.take(CAMERA_INFO, somebody.info())
     for index in range(STILL):
@@ -105,7 +105,7 @@ def test_background_is_learned_from_an_empty_scene(session, outputs, somebody):
 
 
 def test_masks_are_the_silhouettes(session, outputs, somebody, stub_predictor):
-    """Without a background; what is far from the person is somebody else."""
+    """Without a background; distant parts belong to another person."""
     one = session(background_file='', use_mask=True)
     one.take(CAMERA_INFO, somebody.info())
     mask = somebody.mask(0)
@@ -116,7 +116,7 @@ def test_masks_are_the_silhouettes(session, outputs, somebody, stub_predictor):
         (240, True)
     ]
     assert (one.state.status, one.state.height, one.state.wants) == ('predicting', 24, '')
-    # Images without a person are those that the background is learned from.
+    # The background is learned from images without a person.
     for index in range(1, 8):
         one.take(MASK, somebody.nobody(index))
         one.take(IMAGE, somebody.empty(index))
@@ -182,7 +182,7 @@ def test_one_image_is_predicted_on_demand(session, somebody, stub_predictor, mad
     one.take(IMAGE, somebody.image(0))
     content = pose_mixture_of(one.predict_once(message))
     assert (content.kind, content.stamp_ns) == (MixtureKind.PREDICTION, somebody.stamp(7))
-    # It is not part of the sequence.
+    # The image is not part of the sequence.
     assert stub_predictor.asked[-1][1] is None
     assert one.state.counts == {'received': 1, 'predicted': 1}
     with pytest.raises(ValueError, match='nobody is seen: the silhouette is 0 px high'):
@@ -261,7 +261,7 @@ def test_track_counts_no_more_after_time_has_jumped(session, somebody, stub_pred
     assert one.take(IMAGE, somebody.image(1)).published == ()
     assert len(one.take(IMAGE, somebody.image(2)).published) == 2
     assert len(stub_predictor.asked) == 3
-    # What can not be used is told of as usual.
+    # Unusable messages are reported as usual.
     one.take(TRACK, track(likelihoods, 2))
     one.parameters = replace(one.parameters, reset_on_time_jump=False)
     assert 'comes after one of' in one.take(IMAGE, somebody.image(1)).faults[0]
@@ -285,7 +285,7 @@ def test_every_image_has_a_silhouette_that_is_a_mask(
     ((asked, *_),) = stub_predictor.asked
     assert np.array_equal(masks[0], asked)
     assert [int(mask.sum()) for mask in masks[1:]] == [masks[0].sum(), 0]
-    # Another predictor that takes it as its mask says the same.
+    # Another session that gets it as a mask has the same result.
     other = session(use_mask=True)
     other.take(CAMERA_INFO, somebody.info())
     other.take(IMAGE, somebody.image(0))
@@ -298,7 +298,7 @@ def test_every_image_has_a_silhouette_that_is_a_mask(
 
 @pytest.fixture
 def walker():
-    """A camera, and keypoints of somebody in front of it."""
+    """A camera, and keypoints of a person in front of it."""
     body, camera = load_body('human37'), Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
     pose = body.prior_mean.copy()
     pose[:3] = 0.2, 0.0, 4.0
@@ -384,7 +384,7 @@ def test_silhouettes_count_where_keypoints_show_nobody(both, outputs, somebody, 
         one.take('keypoints', keypoints(index, count))
     assert [len(x.components) for x in predictions(outputs)] == [2, 2]
     assert len(stub_predictor.asked) == 2
-    # Nor are those of the image before taken for those of an image without any.
+    # Keypoints of the previous image are not used for an image without any.
     one.take(IMAGE, somebody.image(2))
     one.take('keypoints', keypoints(2))
     one.take(IMAGE, somebody.image(3))

@@ -219,7 +219,7 @@ def test_bad_files(text, message, tmp_path):
 
 
 def test_stereo_files_of_opencv(tmp_path):
-    """Matrices of integers and floats, several cameras, and numbers that are none, elsewhere."""
+    """Matrices of integers and floats, several cameras, and invalid numbers elsewhere."""
     for suffix in ('yaml', 'xml', 'json'):
         path = tmp_path / f'stereo.{suffix}'
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)

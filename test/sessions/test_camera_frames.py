@@ -1,4 +1,4 @@
-"""Gravity from parameters and transforms, as the tracker gets it."""
+"""Gravity from parameters and transforms, as passed to the tracker."""
 
 import numpy as np
 import pytest
@@ -26,12 +26,12 @@ def session(stub_tracker, subject_file, outputs):
 
 
 def view(index, *, height=1.2, pitch=0.1):
-    """A camera over a floor that looks down by `pitch` more at each image."""
+    """A camera above a floor, with its pitch increased by `pitch` at each image."""
     return Viewpoint(distance=4.0, height=height, pitch=pitch * index)
 
 
 def transforms(stamp, *, seen=None, frames=('world', 'lens'), **options):
-    """The camera in the world."""
+    """Transforms with the camera's pose in the world."""
     seen = view(0) if seen is None else seen
     place = seen.to_world(np.zeros(3))
     return transforms_message(
@@ -81,21 +81,21 @@ def test_missing_transforms_do_not_stop_the_track(session, stub_tracker, small_c
     warnings = []
     for index in range(8):
         warnings += one.take(IMAGE, small_camera.image(index)).warnings
-    # Each waits for one that is 0.15 s younger.
+    # Each waits for a transform that is 0.15 s newer.
     assert len(grounds(outputs)) == 6
     assert warnings == [
         f"no transform from gravity_frame 'world' to 'lens' at the image of "
         f"{small_camera.stamp(0)} ns: there is no frame 'world'; there are: base, map; the track "
-        'continues with what was known of gravity'
+        'continues with the last known gravity'
     ]
     assert one.state.faults == {'no transform': 6}
     (tracker,) = stub_tracker.made
     np.testing.assert_allclose(tracker.known_ground.up, [0.0, -1.0, 0.0])
-    # What waits is not tracked later than it must be.
+    # Waiting images are tracked as soon as possible.
     one.take(TF, at(small_camera, 6))
     assert len(grounds(outputs)) == 7
     np.testing.assert_allclose(tracker.gravities[-1], up_of(6), atol=1e-12)
-    # A transform of a later time: none of this one comes any more.
+    # A transform of a later time shows that none of this time will arrive.
     one.take(TF, transforms(small_camera.stamp(9), frames=('map', 'base')))
     assert len(grounds(outputs)) == 8
     np.testing.assert_allclose(tracker.gravities[-1], up_of(6), atol=1e-12)
@@ -181,14 +181,14 @@ def test_a_missing_pose_is_told_once_and_loses_no_image(session, stub_tracker, s
     last, wanted = small_camera.stamp(1), small_camera.stamp(2)
     assert warnings == [
         f"no transform from 'lens' to fixed_frame 'world' at the image of {wanted} ns: 'lens' has "
-        f'transforms of {small_camera.stamp(0)} to {last} ns, wanted {wanted} ns; the camera is '
-        'taken to go on as before for 0.5 s'
+        f'transforms of {small_camera.stamp(0)} to {last} ns, wanted {wanted} ns; the motion '
+        'of the camera is assumed to continue for 0.5 s'
     ]
     assert one.state.faults == {'no pose of the camera': 3}
 
 
 def test_stale_gravity_is_not_given_again(session, stub_tracker, small_camera):
-    """Where transforms end the tracker carries gravity by itself."""
+    """Without further transforms the tracker propagates gravity by itself."""
     one = session(fixed_frame='world', input_timeout=0.0)
     one.take(CAMERA_INFO, small_camera.info())
     for index in range(4):

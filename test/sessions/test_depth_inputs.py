@@ -1,4 +1,4 @@
-"""Depth images in the session of the filter, with a tracker that costs nothing."""
+"""Depth images in the session of the filter, with a stub tracker."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def session(stub_tracker, subject_file, outputs, small_camera):
 
 
 def depths(stub_tracker):
-    """Largest depth that goes with each image, None where there was none."""
+    """The largest depth passed with each image, None without a depth image."""
     return [
         None if depth is None else float(depth.max())
         for tracker in stub_tracker.made
@@ -35,7 +35,7 @@ def depths(stub_tracker):
 
 
 def test_depth_goes_with_the_image_of_its_stamp(session, small_camera, stub_tracker):
-    """In whatever order they come, in mm or in m."""
+    """This holds in any order of arrival, in mm and in m."""
     one = session()
     one.take(IMAGE, small_camera.image(0))
     one.take(IMAGE, small_camera.image(1))
@@ -53,12 +53,12 @@ def test_depth_goes_with_the_image_of_its_stamp(session, small_camera, stub_trac
     [
         (lambda c: c.mask(0), "depth has encoding 'mono8', wanted 16UC1 in mm or 32FC1 in m"),
         (lambda c: c.depth(0, size=(32, 24)), 'has 32x24 pixels, wanted the 64x48 of its image'),
-        (lambda c: c.depth(0, metres=0.0), 'lies nowhere between 0.2 and 20 m'),
-        (lambda c: c.depth(0, metres=60.0), 'lies nowhere between 0.2 and 20 m'),
+        (lambda c: c.depth(0, metres=0.0), 'has no value between 0.2 and 20 m'),
+        (lambda c: c.depth(0, metres=60.0), 'has no value between 0.2 and 20 m'),
     ],
 )
 def test_bad_depth_is_told_once_and_not_used(session, small_camera, stub_tracker, bad, text):
-    """The image need not wait any longer; the next depth image is used."""
+    """The image stops waiting, and the next depth image is used."""
     one = session()
     first = one.take(DEPTH, bad(small_camera))
     second = one.take(IMAGE, small_camera.image(0))
@@ -81,7 +81,7 @@ def test_depth_of_something_else_is_told_once(session, small_camera, stub_tracke
 
 
 def test_several_people_are_seen_with_the_same_depth(small_camera, monkeypatch):
-    """Images wait for the depth as for the detections, and go on without."""
+    """Images wait for the depth as for the detections, and are processed without it at last."""
     seen = []
 
     def nobody(self, waiting, *_):

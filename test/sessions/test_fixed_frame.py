@@ -1,4 +1,4 @@
-"""Mixtures in a frame that stands still, and what the smoother makes of them."""
+"""Mixtures in a fixed frame, and their smoothing."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ from msg_tools.messages.states import transforms_message
 
 
 def camera_at(index):
-    """A camera that drives round the person, nods, and rolls a little: pose in odom."""
+    """Pose in odom of a camera that moves around the person, nods, and rolls a little."""
     turn = Rotation.from_euler('zyx', [0.25 * index, 0.1 * np.sin(index), 0.05]).as_matrix()
     return Transform(turn @ FROM_OPTICAL, np.array([-3.0 + 0.4 * index, 0.2 * index, 1.2]))
 
@@ -77,13 +77,13 @@ def test_poses_are_carried_over_exactly(body, mixture):
     found, moved = fixed.placed(body, mixture, velocities)
     joints = fixed.motion.points(body.joint_positions(mixture.means))
     np.testing.assert_allclose(body.joint_positions(found.means), joints, atol=1e-9)
-    # In odom they are where the camera sees them.
+    # Positions in odom agree with those in the camera frame.
     camera = fixed.camera
     seen = body.joint_positions(mixture.means) @ camera.rotation.T + camera.translation
     np.testing.assert_allclose(body.joint_positions(found.means) @ FROM_OPTICAL.T, seen, atol=1e-9)
     turn = fixed.motion.rotation
     before, after = body.joint_jacobians(mixture.means), body.joint_jacobians(found.means)
-    # Velocities and covariances of the joints turn with the frame.
+    # Velocities and covariances of the joints rotate with the frame.
     speeds = np.einsum('kjad,kd->kja', before, velocities) @ turn.T
     np.testing.assert_allclose(np.einsum('kjad,kd->kja', after, moved), speeds, atol=1e-9)
     wide = np.einsum('kjad,kde,kjbe->kjab', before, mixture.covariances, before)
@@ -97,7 +97,7 @@ def test_poses_are_carried_over_exactly(body, mixture):
 
 @pytest.mark.parametrize('heading', np.arange(0.0, 360.0, 75.0))
 def test_somebody_who_stands_is_far_from_the_poles(body, heading):
-    """Whichever way person and camera look."""
+    """For all directions of person and camera."""
     pose = np.tile(body.prior_mean, (1, 1))
     pose[:, 2], pose[:, 3] = 4.0, np.radians(heading)
     one = GaussianMixture([1.0], pose, 1e-4 * np.eye(37)[None])
@@ -110,7 +110,7 @@ def test_somebody_who_stands_is_far_from_the_poles(body, heading):
 
 
 def test_a_camera_that_turns_round_gives_no_jump(body):
-    """The angle about z goes on through whole turns, in both ways to face."""
+    """The angle about z is continuous over whole turns, for both facings."""
     pose = np.tile(body.prior_mean, (2, 1))
     pose[:, 2], pose[:, 3] = 4.0, [0.5, 0.5 + np.pi]
     both = GaussianMixture([0.6, 0.4], pose, np.tile(1e-4 * np.eye(37), (2, 1, 1)))
@@ -131,7 +131,7 @@ def test_upright(up):
     np.testing.assert_allclose(found.T @ found, np.eye(3), atol=1e-12)
     assert np.linalg.det(found) == pytest.approx(1.0)
     np.testing.assert_allclose(found[:, 2], up)
-    # Forward is where the camera looks, or its upper edge where it looks down.
+    # Forward is the viewing direction, or the image's upper edge if the camera looks down.
     assert found[:, 0] @ ([0, 0, 1] if abs(up[1]) > 0.1 else [0, -1, 0]) > 0.9
 
 
@@ -179,7 +179,7 @@ def test_messages_in_the_fixed_frame(session, small_camera, outputs, body):
         np.testing.assert_allclose(there, camera.rotation @ place + camera.translation, atol=1e-9)
     marker = read(outputs, 'markers')[-1].markers[0]
     assert marker.header.frame_id == 'odom'
-    # Transforms lead from odom to the frame of the mixtures.
+    # Transforms connect odom to the frame of the mixtures.
     (leads,) = [
         t for t in read(outputs, '/tf')[-1].transforms if t.child_frame_id == 'odom_optical'
     ]
@@ -195,7 +195,7 @@ def test_what_has_no_place_is_not_published(session, small_camera, outputs):
     texts = [text for each in handled for text in each.faults]
     assert any('its place in fixed_frame' in text for text in texts)
     assert {output.topic for output in outputs} == {'keep_out', 'keep_out_markers'}
-    # The person goes on from where the place was last known.
+    # The person continues from the last known position.
     states = [keep_out_of(message).state for message in read(outputs, 'keep_out')]
     assert set(states) == {KeepOutState.LOST}
 
@@ -209,7 +209,7 @@ def test_no_track_starts_from_a_mixture_in_the_fixed_frame(session, small_camera
     one = session()
     track(one, small_camera, (0,))
     (mixture,) = read(outputs, 'pose_mixture')
-    with pytest.raises(ValueError, match='frame odom_optical, which stands still: wanted that of'):
+    with pytest.raises(ValueError, match='frame odom_optical, which does not move: wanted that of'):
         prepare_start(one.parameters, mixture)
     mixture.header.frame_id = 'lens'
     assert prepare_start(one.parameters, mixture).initial is not None
@@ -218,7 +218,7 @@ def test_no_track_starts_from_a_mixture_in_the_fixed_frame(session, small_camera
 def test_the_smoother_smooths_a_person_before_a_camera_that_moves(
     outputs, monkeypatch, random_walk
 ):
-    """Who stands still in the room stands still, behind the origin of odom, too."""
+    """A person at rest in the room is estimated at rest, also behind the origin of odom."""
     monkeypatch.setattr(smoother_session, 'motion_prior', random_walk)
     body = load_body('human37')
     stands = np.tile(body.prior_mean, (1, 1))
@@ -260,5 +260,5 @@ def test_the_smoother_smooths_a_person_before_a_camera_that_moves(
             assert np.linalg.norm(places - wanted, axis=1).max() < 0.12
             turned = root_rotations(body, np.array([c.means[0] for c in found]))
             np.testing.assert_allclose(turned, np.broadcast_to(turned[0], turned.shape), atol=0.01)
-    # The camera goes round at more than a metre a second.
+    # The camera moves at more than a metre per second.
     assert speeds[True] < 0.25 < 1.0 < speeds[False]

@@ -1,4 +1,4 @@
-"""What an assumed focal length makes of published depths."""
+"""The effect of an assumed focal length on published depths."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ SIGMA = 0.2
 
 @pytest.fixture
 def told(stub_tracker, subject_file, outputs, small_camera):
-    """Last contents of topics, by name, of a session with parameters."""
+    """The last messages of a session with given parameters, by topic."""
 
     def run(**values):
         given = FilterParameters(subject_file=str(subject_file), **values)
@@ -37,7 +37,7 @@ def told(stub_tracker, subject_file, outputs, small_camera):
 
 
 def test_depths_alone_are_as_uncertain_as_the_focal_length(told):
-    """At 4 m: 0.8 m along the optical axis, in poses and joints, of now and later."""
+    """At 4 m: 0.8 m along the optical axis, in poses and joints, now and in predictions."""
     known = told(forecast_rate=20.0)
     guessed = told(forecast_rate=20.0, focal_length_sigma=SIGMA)
     of_joints = np.zeros((3, 3))
@@ -53,10 +53,10 @@ def test_depths_alone_are_as_uncertain_as_the_focal_length(told):
         assert np.allclose(change, of_joints, atol=1e-6)
     deep = [np.ptp(x['keep_out'].starts[:, 2]) for x in (known, guessed)]
     wide = [np.ptp(x['keep_out'].starts[:, 0]) for x in (known, guessed)]
-    # Both ways 3.4 deviations: the 99 % of three axes.
+    # 3.4 standard deviations both ways: 99 % in three dimensions.
     assert deep[1] - deep[0] == pytest.approx(2 * 3.4 * 0.8, rel=0.15)
     assert abs(wide[1] - wide[0]) < 0.2
-    # A smoother counts it once: beside the likelihood, as the error that all images share.
+    # A smoother counts it once, apart from the likelihood, as the error that all images share.
     before, after = (x['likelihood_mixture'] for x in (known, guessed))
     assert np.array_equal(before.mixture.covariances, after.mixture.covariances)
     change = after.shape_covariance - before.shape_covariance
@@ -65,7 +65,7 @@ def test_depths_alone_are_as_uncertain_as_the_focal_length(told):
 
 
 def test_it_is_what_another_focal_length_does_to_a_pose():
-    """Before a longer lens the pose with the same image is deeper by its share, at first order."""
+    """With a longer lens the pose with the same image is deeper in proportion, to first order."""
     body = load_body('human37')
     pose = np.clip(body.prior_mean, body.lower, body.upper)[None]
     pose[:, :3] = 0.3, -0.2, 6.0

@@ -1,4 +1,4 @@
-"""The rules by which mixtures become the bodies of REP 155."""
+"""The HRI session: mixtures become bodies of REP 155."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def session(outputs):
 
 @pytest.fixture
 def people(likelihoods):
-    """Makes mixtures of a track; two modes, of which the second bends an elbow more."""
+    """Makes mixtures of a track with two modes; the second bends an elbow more."""
 
     def make(
         index, track=1, state=TrackState.TRACKING, weights=(0.6, 0.4), at=(0.0, 0.0), **fields
@@ -103,7 +103,7 @@ def test_a_body_is_a_track(session, outputs, people, small_camera):
     assert one.state.counts == {'received': 5, 'converted': 5}
     assert (one.state.status, one.state.bodies) == ('tracking', ('p1_2',))
     assert one.identities == {'p1_2'}
-    # What is lost is not shown.
+    # Lost tracks are not shown.
     stamps = [o.stamp_ns for o in outputs if o.topic == body_topic('p1_1', 'joint_states')]
     assert stamps == [small_camera.stamp(i) for i in (0, 2)]
 
@@ -117,7 +117,7 @@ def test_tracks_without_a_number_are_counted(session, outputs, people):
 
 
 def test_no_identity_is_used_twice(session, outputs, people):
-    """A filter that was started again counts its tracks from 1 again."""
+    """A restarted filter counts its tracks from 1 again."""
     one = session()
     one.take(P1, people(0, 3))
     one.take(P1, people(1, 3, TrackState.NOBODY))
@@ -159,7 +159,7 @@ def test_joint_states_and_frames_are_those_of_the_urdf(session, outputs, people,
     _, frames = read(outputs, FRAMES)
     assert {f'{name}_p1_1' for name in REFERENCE_JOINTS} < set(states.name)
     angles = dict(zip(states.name, states.position, strict=True))
-    # Forward kinematics of the URDF alone, as robot_state_publisher has them.
+    # Forward kinematics from the URDF alone, as in robot_state_publisher.
     robot = ET.fromstring(urdf.data)
     assert robot.find("link[@name='body_p1_1']") is not None
     root = frames.transforms[0]
@@ -180,7 +180,7 @@ def test_joint_states_and_frames_are_those_of_the_urdf(session, outputs, people,
             placed['body_p1_1'] @ matrix(each.transform), placed[each.child_frame_id], atol=1e-9
         )
     assert len(frames.transforms) == len(placed)
-    # They pass through the joints of the heaviest mode.
+    # The links pass through the joints of the heaviest mode.
     body = likelihoods.body
     pose = likelihoods.mixture(4).means[0].copy()
     pose[:2] = 0.0
@@ -244,7 +244,7 @@ def test_region_and_landmarks(session, outputs, people, small_camera, likelihood
     for name in ('left_wrist', 'right_knee', 'neck', 'right_hip'):
         joint = list(body.joint_names).index(name)
         np.testing.assert_allclose(at[name], CAMERA.project(joints[0, joint]), atol=1e-4)
-        # A mode that bends the elbow otherwise has the wrist elsewhere.
+        # A mode with another elbow angle has the wrist elsewhere.
         assert sure[name] == pytest.approx(0.6 if name == 'left_wrist' else 1.0)
     assert sure['left_eye'] == sure['right_eye'] == 0.0
     # A person at rest faces the camera: the left ear is on the right in the image.
@@ -264,7 +264,7 @@ def test_a_body_beyond_the_image_has_no_region(session, outputs, people, small_c
     one.take(P1, people(0, at=(9.0, 0.0)))
     assert not any(o.topic.endswith(('roi', 'skeleton2d', 'cropped')) for o in outputs)
     assert tracked(outputs) == [['p1_1']]
-    # Half of a body at the border.
+    # Half a body at the border.
     one.take(P1, people(1, at=(2.1, 0.0)))
     (region,) = read(outputs, body_topic('p1_1', 'roi'))
     assert region.xmax == 1.0
@@ -283,8 +283,8 @@ def test_a_mode_is_shown_as_long_as_it_counts(session, outputs, people):
         dict(zip(m.name, m.position, strict=True))['l_elbow_p1_1']
         for m in read(outputs, body_topic('p1_1', 'joint_states'))
     ]
-    # The first mode, the same though another is heavier, the second for which it is too light, and
-    # the second, which goes on.
+    # The first mode; the same although another is heavier; the second, as the first is too light;
+    # and the second again.
     wanted = [0.5, 0.55, 0.6 + 0.8, 0.65 + 0.8]
     np.testing.assert_allclose(elbows, wanted, atol=1e-3)
 

@@ -1,4 +1,4 @@
-"""The table of inputs: what a session, a node and a replay know of an input follows from it."""
+"""The table of inputs defines everything about an input in session, node and replay."""
 
 from dataclasses import dataclass, replace
 
@@ -32,7 +32,7 @@ def _read_distance(message, stamp):
     return float(message.range)
 
 
-# A radio that tells how far away the person is. What another input takes: this row ...
+# A radio that measures the person's distance. A new input needs this row ...
 UWB = ImageInput(
     'uwb', {'uwb': RANGE}, 'use_uwb', _read_distance,
 )  # fmt: skip
@@ -81,16 +81,16 @@ def test_an_input_is_a_row_and_its_parameter(
     assert outputs == []
     one.take('uwb', distance(small_camera, 0))
     assert one.heard == [2.5]
-    # What can not be used counts as none, and is told.
+    # An invalid message counts as missing, and is reported.
     (fault,) = one.take('uwb', distance(small_camera, 1, np.nan)).faults
     assert fault == f'uwb of {small_camera.stamp(1)} ns is nan m, wanted a distance'
     one.take(IMAGE, small_camera.image(1))
     assert one.heard == [2.5, None]
-    # Without its parameter nobody waits.
+    # Without its parameter images do not wait.
     one.parameters = replace(p, use_uwb=False)
     one.take(IMAGE, small_camera.image(2))
     assert one.heard == [2.5, None, None]
-    # Bags have it, under its name.
+    # Bags contain it under its name.
     with BagWriter(tmp_path / 'bag') as bag:
         for topic, message in (
             ('/image', small_camera.image(0)), ('/camera_info', small_camera.info()),
@@ -125,11 +125,9 @@ def test_an_input_of_no_image_is_told(small_camera):
         given.put('detections', None, stamp, lambda message, stamp: ['somebody'])
     assert given.take(MASK_INPUT, 3, image, dropped={2}) is not None
     assert log.faults == {'mask without an image': 1}
-    assert log.last_fault.startswith('mask of 1 ns: no image has this stamp, or waits any more')
+    assert log.last_fault.startswith('mask of 1 ns: no image with this stamp waits')
     given.take(DETECTIONS_INPUT, 2, image, dropped=())
-    assert log.last_fault.startswith(
-        'detections of 1 ns: no image has this stamp, or waits any more'
-    )
+    assert log.last_fault.startswith('detections of 1 ns: no image with this stamp waits')
     assert given.take(DETECTIONS_INPUT, 5, image, dropped={3}) is None
     assert log.last_fault == 'no detections came for the image of 5 ns'
     with pytest.raises(KeyError):

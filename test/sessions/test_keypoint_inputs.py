@@ -1,4 +1,4 @@
-"""Keypoints in the plane and in space that come to the filter, and what their names mean."""
+"""2D and 3D keypoints as inputs of the filter, and the meaning of their names."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from test.sessions.conftest import JOINTS
 
 @pytest.fixture
 def session(stub_tracker, subject_file, outputs, small_camera):
-    """A session that knows its camera."""
+    """A session with a known camera."""
 
     def make(**values):
         values = {'subject_file': str(subject_file), 'use_keypoints': True, **values}
@@ -28,7 +28,7 @@ def session(stub_tracker, subject_file, outputs, small_camera):
 
 
 def seen(stub_tracker):
-    """Keypoints of each image."""
+    """Keypoints used for each image."""
     return [keypoints for _, keypoints in stub_tracker.made[0].seen]
 
 
@@ -36,7 +36,7 @@ def seen(stub_tracker):
     ('scheme', 'names', 'unknown', 'used'),
     [
         ('auto', ('nose', 'left_ear'), [], ('head', 'head')),
-        # No mistake: a landmark of a scheme that no joint is near.
+        # Valid: a landmark of a scheme without a nearby joint.
         ('auto', ('nose', 'spine'), [], ('head',)),
         ('auto', ('tail', 'left_foot_index'), ['tail'], ('left_toe',)),
         ('joints', ('neck', 'mid_hip'), ['mid_hip'], ('neck',)),
@@ -91,14 +91,14 @@ def test_parameters_of_keypoints():
         FilterParameters(keypoint_scheme='coco')
 
 
-# Who is followed among several people.
+# Choice of the person among several people.
 
 NAMES = ('left_hip', 'right_hip', 'head')
 SECOND = 10**9
 
 
 def person(column, size=100.0, missing=()):
-    """Somebody whose head is in a column."""
+    """Keypoints of a person with the head in a column."""
     pixels = size * np.array([[-0.1, 1.0], [0.1, 1.0], [0.0, 0.0]]) + (column, 50.0)
     pixels[list(missing)] = np.nan
     covariances = np.tile(np.eye(2), (3, 1, 1))
@@ -119,7 +119,7 @@ def choose():
 
 def test_first_the_largest_then_the_nearest(choose):
     assert choose(0.0, person(100, 80), person(400, 120)) == 1
-    # The other one comes nearer to the camera, in another order.
+    # The other person approaches the camera, and the order changes.
     assert choose(0.1, person(410, 100), person(110, 300)) == 0
     assert choose(0.2, person(130, 300), person(420, 100)) == 1
 
@@ -142,6 +142,6 @@ def test_after_an_absence_the_largest_is_chosen_anew(choose):
 def test_landmarks_that_are_missing(choose):
     assert choose(0.0, person(100)) == 0
     assert choose(0.1, person(300, missing=(1, 2)), person(105, missing=(1, 2))) == 1
-    # Of the left hip before, nothing is seen.
+    # The previously visible left hip is missing.
     assert choose(0.2, person(300, missing=(0, 2)), person(110, missing=(0, 2))) == 1
     assert choose(0.3, person(100, missing=(0, 1, 2))) is None

@@ -1,4 +1,4 @@
-"""Keypoints of other detectors, as they come to the filter and to the experts."""
+"""Keypoints of other detectors, as the filter and the experts receive them."""
 
 from types import SimpleNamespace
 
@@ -48,7 +48,7 @@ def skeleton(camera, index, x=0.5):
 
 
 def yolo(camera, index, **people):
-    """People by id: column of their left side and height, px."""
+    """Detections of people by id, from the column of their left side and their height, px."""
     detections = []
     for name, (column, height) in people.items():
         places = [(column, 10.0), (column, 10.0 + height)]
@@ -77,7 +77,7 @@ def floats(camera, rows, label=''):
 def test_a_skeleton_needs_the_size_of_the_image(session, seen, small_camera):
     one = session('skeleton2d')
     (fault,) = one.take(DETECTIONS, skeleton(small_camera, 0)).faults
-    assert 'it comes before a calibrated camera_info, which tells the size of the image' in fault
+    assert 'it comes before a calibrated camera_info, which gives the size of the image' in fault
     one.take(CAMERA_INFO, small_camera.info())
     assert one.take(DETECTIONS, skeleton(small_camera, 1)).faults == ()
     one.take(IMAGE, small_camera.image(1))
@@ -90,7 +90,7 @@ def test_a_skeleton_needs_the_size_of_the_image(session, seen, small_camera):
 
 
 def people(one, camera, *detections):
-    """Hands over what a detector sees in images 0, 1, ... and the images."""
+    """Hands over the images 0, 1, ... and what a detector sees in them."""
     one.take(CAMERA_INFO, camera.info())
     for index, seen in enumerate(detections):
         assert one.take(DETECTIONS, yolo(camera, index, **seen)).faults == ()
@@ -110,7 +110,7 @@ def test_floats_have_the_stamp_of_the_image(session, seen, small_camera):
     one = session('floats', keypoint_scheme='coco17')
     rows = np.ones((17, 3))
     (fault,) = one.take(DETECTIONS, floats(small_camera, rows)).faults
-    assert 'it comes before a camera_info, which tells its stamp' in fault
+    assert 'it comes before a camera_info, which gives its stamp' in fault
     one.take(CAMERA_INFO, small_camera.info(3))
     one.take(DETECTIONS, floats(small_camera, rows))
     one.take(IMAGE, small_camera.image(3))
@@ -124,6 +124,6 @@ def test_detections_that_can_not_be_used_are_told(session, small_camera):
     one.take(CAMERA_INFO, small_camera.info(0))
     (fault,) = one.take(DETECTIONS, floats(small_camera, np.ones((17, 3)))).faults
     assert 'wanted 26x2 or 26x3 of the scheme halpe26' in fault
-    # It counts as none: the image need not wait for it.
+    # It counts as no detection: the image need not wait.
     one.take(IMAGE, small_camera.image(0))
     assert one.state.counts['tracked'] == 1

@@ -1,4 +1,4 @@
-"""The rules of the detection, with a detector that costs nothing."""
+"""The keypoints session, with stub detectors."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ NAMES = schemes()['mediapipe33'].names
 
 
 class StubDetector:
-    """What `BlazePose` shows; somebody is where the image is white."""
+    """Stub of `BlazePose`; a person is where the image is white."""
 
     def __init__(self, *, with_mask):
         self.with_mask, self.mask = with_mask, None
@@ -51,7 +51,7 @@ def session(outputs, monkeypatch):
 
 
 def read(outputs):
-    """The messages of each image by topic, in their order."""
+    """Messages by topic, in their order."""
     found = {}
     for topic, stamp, data in outputs:
         found.setdefault(stamp, {})[topic] = deserialise(data, TOPICS[topic].msgtype)
@@ -121,7 +121,7 @@ def test_time_that_jumps_back(session, outputs, somebody):
 
 
 class StubPeople:
-    """What `PeopleDetector` shows: up to `most` of two people where the image is white."""
+    """Stub of `PeopleDetector`: up to `most` of two people where the image is white."""
 
     def __init__(self, most):
         self.most, self.left_out = most, 0

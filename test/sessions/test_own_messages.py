@@ -1,4 +1,4 @@
-"""Messages that come back to their publisher."""
+"""Messages that a session receives from itself."""
 
 from hmt_ros.nodes import own_messages
 from hmt_ros.nodes.own_messages import OwnMessages
@@ -12,7 +12,7 @@ def test_each_message_comes_back_once():
     own.sent(HEAD + b'two')
     own.sent(HEAD + b'one')
     assert not own.is_own(HEAD + b'three')
-    # The middleware pads the end, and says in the head by how much.
+    # The middleware pads the end and puts the padding's length into the header.
     assert own.is_own(b'\x00\x01\x00\x01one\0')
     assert own.is_own(HEAD + b'one')
     assert not own.is_own(HEAD + b'one')

@@ -1,4 +1,4 @@
-"""The rules of several people, with trackers that cost nothing."""
+"""The session for several people, with stub trackers."""
 
 from types import SimpleNamespace
 
@@ -36,7 +36,7 @@ SHAPE = np.array([[3, -10], [-3, -10], [2, 0], [-2, 0], [2, 7], [-2, 7], [2, 14]
 
 
 class Follower(StubTracker):
-    """Stands where its keypoints are, 4 m away, and leaves when it had none for three images."""
+    """Stub at its keypoints, 4 m away; its track ends after three images without keypoints."""
 
     missed = 0
     pose = None
@@ -99,7 +99,7 @@ def seen(camera, index, *people):
 
 
 def show(one, camera, index, *people):
-    """An image and its detections; what became of both."""
+    """Sends an image and its detections; returns both results."""
     first = one.take(DETECTIONS, seen(camera, index, *people))
     second = one.take(IMAGE, camera.image(index))
     return [*first.events, *first.warnings, *second.events, *second.warnings]
@@ -155,7 +155,7 @@ def test_everybody_is_shown_together_until_they_leave(session, outputs, small_ca
         show(one, small_camera, i, somebody_at(15))
     kind = published_topic('markers').msgtype
     arrays = [deserialise(x.data, kind).markers for x in outputs if x.topic == 'markers']
-    # By person, the actions on their markers: 0 adds, 2 deletes.
+    # Actions on the markers by person: 0 adds, 2 deletes.
     actions = [
         {name: {x.action for x in each if x.ns.startswith(name)} for name in ('p1', 'p2')}
         for each in arrays
@@ -178,7 +178,7 @@ def test_identities_stay_through_a_crossing(session, outputs, small_camera):
     last = [x for x in outputs if x.topic == PEOPLE][-1]
     found = people_of_message(deserialise(last.data, PEOPLE_2D), 0.0)
     columns = {x.name: float(np.nanmean(x.keypoints.pixels[:, 0])) for x in found}
-    # In the first image the second one came first.
+    # In the first image the second person is listed first.
     assert columns['p1'] == pytest.approx(12, abs=4)
     assert columns['p2'] == pytest.approx(52, abs=4)
     assert len(StubTracker.made) == 2
@@ -190,7 +190,7 @@ def test_who_is_nearer_hides_who_is_farther(session, small_camera):
         show(one, small_camera, i, somebody_at(28), somebody_at(34))
     near, far = StubTracker.made
     assert near.pose[2] < far.pose[2]
-    # All that the nearer one covers is unknown to the other, who leaves a part to the nearer one.
+    # The nearer person hides image parts from the other, who also hides a part from the nearer one.
     assert far.others.sum() > 2 * near.others.sum() > 0
     assert (near.others & far.others).sum() < 0.2 * near.others.sum()
 
@@ -198,7 +198,7 @@ def test_who_is_nearer_hides_who_is_farther(session, small_camera):
 def test_an_identity_of_the_detector_is_kept(session, outputs, small_camera):
     one = started(session(), small_camera)
     show(one, small_camera, 0, somebody_at(15, 'anna'), somebody_at(50, '7'))
-    # They change places at once: the detector says so.
+    # The detector reports that they suddenly swap places.
     show(one, small_camera, 1, somebody_at(15, '7'), somebody_at(50, 'anna'))
     assert listed(outputs) == [['anna', 'p7']] * 2
     columns = [person.pose[0] for person in StubTracker.made]
@@ -228,7 +228,7 @@ def test_the_largest_are_followed_and_the_others_are_told_once(session, outputs,
     assert 'max_people is 2: the others are not followed' in text
     assert not any('max_people' in x for x in show(one, small_camera, 1, *crowd))
     assert len(StubTracker.made) == 2
-    # Who stands as near to the largest as those in between may be the same person.
+    # Detections too near to the largest one may be the same person.
     assert {round(x.pose[0] * 60 / x.pose[2] + 31.5) for x in StubTracker.made} == {57, 45}
 
 
@@ -262,7 +262,7 @@ def test_detections_without_an_image_and_images_without_detections(session, smal
     show(one, small_camera, 0, somebody_at(15))
     one.take(DETECTIONS, seen(small_camera, 0.5, somebody_at(15)))
     told = show(one, small_camera, 1, somebody_at(15))
-    assert [x for x in told if 'no image has this stamp' in x]
+    assert [x for x in told if 'no image with this stamp waits' in x]
     # The image of 2 waits for its detections, until those of 3 come.
     assert one.take(IMAGE, small_camera.image(2)).published == ()
     told = show(one, small_camera, 3, somebody_at(15))

@@ -1,4 +1,4 @@
-"""What a robot acts on: forecasts, and the space to keep out of, over time."""
+"""Outputs for robots over time: forecasts and the keep-out space."""
 
 import math
 from types import SimpleNamespace
@@ -60,7 +60,7 @@ def test_before_the_first_image_nothing_is_known():
 def test_a_person_who_is_seen_is_inside(robot):
     content = robot.keep_out(0.5)
     assert (content.state, content.stamp_ns, content.unseen) == (FOUND, START, 0.0)
-    # That of the image, whatever is asked for now.
+    # The probability of the image, not the one requested now.
     assert content.probability == 0.99
     joints = BODY.joint_positions(seen(START).posterior.means)[0]
     assert capsules(content).contain(joints).all()
@@ -72,7 +72,7 @@ def test_who_is_lost_may_be_as_far_as_people_move(robot):
     after = robot.keep_out(0.99)
     assert (after.state, after.unseen) == (LOST, 0.5)
     np.testing.assert_allclose(after.radii, before.radii + reach_after(0.5))
-    # Images that say nothing do not stop it, a silent camera does not either.
+    # Neither images without information nor a silent camera stop it.
     silent = robot.keep_out(0.99, silence=0.25)
     assert (silent.state, silent.unseen) == (KeepOutState.STALE, 0.75)
     assert silent.stamp_ns == START + 3 * SECOND_NS // 4
@@ -82,7 +82,7 @@ def test_who_is_lost_may_be_as_far_as_people_move(robot):
 def test_only_an_image_without_anybody_frees_the_space(robot):
     robot.tell(START + SECOND_NS, 'lens', NOBODY, 3, 0.05)
     assert (robot.keep_out(0.99).state, len(robot.keep_out(0.99).radii)) == (NOBODY, 0)
-    # A camera that stops then has not said so of the time after.
+    # If the camera then stops, nothing is known about later times.
     assert robot.keep_out(0.99, silence=2.0).state is KeepOutState.STALE
     robot.forget()
     assert robot.keep_out(0.99).state is KeepOutState.UNKNOWN
@@ -120,7 +120,7 @@ def test_each_time_of_a_grid_is_told_of_once(robot):
     assert first == [START + 10_000_000 * k for k in range(1, 6)]
     assert list(robot.due(100.0, 0.05)) == []
     robot.tell(START + 33_333_333, 'lens', FOUND, 3, 0.9, seen(START + 33_333_333))
-    # The grid is that of time, not of images.
+    # The grid is one of time, not of images.
     assert list(robot.due(100.0, 0.05)) == [START + 10_000_000 * k for k in (6, 7, 8)]
     assert list(robot.due(0.0, 0.05)) == []
 

@@ -1,4 +1,4 @@
-"""Images that the filter keeps for the smoother of its process, and windows refined on them."""
+"""Images stored by the filter for the smoother of its process, and windows refined on them."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def seen(likelihoods):
 
 @pytest.fixture
 def smoother(outputs, monkeypatch, random_walk, likelihoods):
-    """A session that has smoothed some mixtures, and the store that it shares."""
+    """A session that has smoothed some mixtures, and its shared image store."""
 
     def make(seen=(), **values):
         monkeypatch.setattr(smoother_session, 'motion_prior', random_walk)
@@ -77,13 +77,13 @@ def test_the_newest_are_kept_as_far_as_memory_allows():
     assert [one is not None for one in images.of(range(1, 6))] == [False, False, True, True, True]
     images.add(*evidence(6, 60_000))
     assert [one is not None for one in images.of([4, 5, 6])] == [True, True, True]
-    # Two of these are more than a megabyte together, and one alone.
+    # Two of these exceed a megabyte, one does not.
     images.add(*evidence(7, 80_000))
     assert [one is not None for one in images.of([5, 6, 7])] == [False, False, True]
     images.add(*evidence(8, 200_000))
     assert images.of([7, 8]) == [None, None]
     images.add(9, None)
-    # Time that goes back is another time.
+    # A step back in time starts a new sequence.
     images.add(*evidence(20, 10))
     images.add(*evidence(10, 10))
     assert [one is not None for one in images.of([10, 20])] == [True, False]

@@ -1,4 +1,4 @@
-"""What all sessions have in common, and those that take images."""
+"""Behaviour common to all sessions, and to those that take images."""
 
 import pytest
 
@@ -23,10 +23,10 @@ def test_frames_of_image_and_camera_info_that_differ_are_told_once(one, small_ca
         .warnings[0]
         .startswith(
             "image on /cam/image has frame_id 'lens', camera_info on /cam/camera_info has "
-            "'camera_link': results are in that of the image; "
+            "'camera_link': results are in the frame of the image; "
         )
     )
-    # The image is used all the same.
+    # The image is used nevertheless.
     assert handled[0].faults == ()
     assert one.state.counts['tracked'] == 3
     assert one.state.frame_id == 'lens'

@@ -1,4 +1,4 @@
-"""The smoother continues the chain of the filter's modes, which its messages carry."""
+"""The smoother continues the chain of the filter's modes, which messages contain."""
 
 import itertools
 from dataclasses import replace
@@ -43,13 +43,13 @@ class Filtered(NamedTuple):
 
     @property
     def message(self):
-        """The likelihood as it comes to a node."""
+        """The likelihood message of the image."""
         return deserialise(self.data, 'hmt_msgs/msg/PoseMixture')
 
 
 @pytest.fixture(scope='module')
 def filtered(body):
-    """Of keypoints alone: limbs may point to the camera or away from it."""
+    """Images tracked from keypoints alone, with limbs towards or away from the camera."""
     tracker, pose = Tracker(body, CAMERA, SETTINGS), body.prior_mean.copy()
     pose[2] = 4.0
     tracker.reset(GaussianMixture(np.ones(1), pose[None], 0.01 * np.eye(len(pose))[None]))
@@ -77,7 +77,7 @@ def in_order(one, weights):
 
 
 def test_the_chain_passes_through_messages(filtered):
-    """Weights given later images, from messages alone, are those of the filter, by identities."""
+    """Weights given later images, from messages alone, equal those of the filter."""
     contents = [pose_mixture_of(one.message) for one in filtered]
     weights, wanted = contents[-1].posterior_weights, filtered[-1].modes.mixture.weights
     for i, (content, one) in reversed([*enumerate(zip(contents, filtered, strict=True))]):
@@ -91,7 +91,7 @@ def test_the_chain_passes_through_messages(filtered):
 
 @pytest.mark.parametrize('lag', [0.0, 0.3, 10.0])
 def test_backward_weights_are_those_of_the_filter(filtered, lag):
-    """The newest image has the filter's weights, those before have its lagged weights."""
+    """The newest image has the filter's weights, earlier ones have its lagged weights."""
     session = SmootherSession(SmootherParameters(fixed_lag=lag), lambda output: None)
     differ = 0.0
     for i, one in enumerate(filtered):
@@ -107,12 +107,12 @@ def test_backward_weights_are_those_of_the_filter(filtered, lag):
             assert own == pytest.approx(in_order(image, wanted.posterior.weights), abs=1e-12)
             changes = np.abs(wanted.posterior.weights - image.modes.mixture.weights)
             differ = max(differ, changes.max())
-    # Later images have decided something.
+    # Later images have changed the weights.
     assert (differ > 1e-3) == (lag > 0.0)
 
 
 def test_published_weights_are_sums_of_them(filtered):
-    """Of one image: modes within 30 mm are one motion, others have their weight."""
+    """In one image, modes within 30 mm are one motion, others keep their weights."""
     outputs = []
     session = SmootherSession(SmootherParameters(fixed_lag=0.0, max_hypotheses=64), outputs.append)
     for one in filtered:
@@ -145,7 +145,7 @@ def test_same_messages_same_smoothed_bytes(filtered):
 
 
 def test_a_message_of_eight_motions(likelihoods, body):
-    """Weights, numbers and stamps of all eight, through bytes; a span on demand has them, too."""
+    """All eight have weights, identities and timestamps, also in a span on demand."""
     outputs, alone = [], replace(likelihoods, hops=0.0)
     session = SmootherSession(SmootherParameters(), outputs.append)
     yaw = body.dof_names.index('root_z')

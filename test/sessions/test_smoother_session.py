@@ -1,4 +1,4 @@
-"""The rules of the session that smooths."""
+"""The smoother session."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ CONSTANTS = ('longest_interval',)
 
 @pytest.fixture(scope='module')
 def likelihoods(likelihoods):
-    """Of two modes that are two motions."""
+    """Likelihoods of two modes that are two motions."""
     return replace(likelihoods, leans=True)
 
 
@@ -49,7 +49,7 @@ def session(outputs, monkeypatch, random_walk):
 
 
 def smoothed(outputs):
-    """Stamps of the poses that have become final."""
+    """Timestamps of the final poses."""
     return [output.stamp_ns for output in outputs if output.topic == 'smoothed_pose_mixture']
 
 
@@ -96,18 +96,18 @@ def test_final_poses_are_mixtures_that_need_no_kinematics(session, outputs, like
             content.joint_positions, body.joint_positions(mixture.means), atol=1e-9
         )
         assert np.array_equal(states[index].position, mixture.means[0])
-        # Each image has a variance of 0.001, neighbours tell a little about it.
+        # Each image has a variance of 0.001, which its neighbours reduce a little.
         elbow = body.dof_names.index('left_elbow')
         for mean, covariance in zip(mixture.means, mixture.covariances, strict=True):
             assert np.abs(seen.means[:, elbow] - mean[elbow]).min() < 0.02
             assert (np.diagonal(covariance) < 1e-3).all()
-        # The elbow that is the more probable all along gets more so with every image.
+        # The elbow that is always more probable gains weight with every image.
         straight = mixture.means[:, elbow] < seen.means[:, elbow].mean()
         assert 0.6 < mixture.weights[straight].sum() < 0.95
 
 
 def test_errors_that_last_are_discounted_once(session, outputs, likelihoods):
-    """The first of three poses, by the dense joint precision of each variable."""
+    """Checks the first of three poses by the dense joint precision of each variable."""
     body = likelihoods.body
     one = session(max_hypotheses=1, fixed_lag=0.3, resting_feet=False)
     errors, stamps, means = CueErrors(0.5, 0.1), (0, 1, 3), []
@@ -116,7 +116,7 @@ def test_errors_that_last_are_discounted_once(session, outputs, likelihoods):
         means.append(mixture.means[0])
         message = likelihoods.message(index, errors=errors, mixture=mixture)
         assert one.take(MIXTURE, message).faults == ()
-    # How closely each image is followed, and the random walk between the poses.
+    # Weight of each image, and the random walk between the poses.
     kept = np.exp([-np.inf, -1.0, -2.0])
     shares = 0.5 / (1.0 - kept**2)
     links = 1.0 / (body.rates[:, None] * [0.1, 0.2])
@@ -135,7 +135,7 @@ def test_errors_that_last_are_discounted_once(session, outputs, likelihoods):
 
 
 def test_likelihoods_without_an_error_model_are_refused(session, outputs, likelihoods):
-    """Those of earlier versions are discounted already; what comes after them is smoothed."""
+    """Likelihoods of earlier versions are already discounted; later messages are smoothed."""
     one = session(longest_interval=1.0)
     handled = [
         one.take(MIXTURE, likelihoods.message(index, errors=UNKNOWN if index < 2 else INDEPENDENT))
@@ -149,7 +149,7 @@ def test_likelihoods_without_an_error_model_are_refused(session, outputs, likeli
     assert one.state.faults == {'error_share and error_time': 2}
     one.finish()
     assert smoothed(outputs) == [likelihoods.stamp(index) for index in (2, 3, 4)]
-    # Somebody leaves: there is nothing to discount.
+    # A person leaves: there is nothing to discount.
     nobody = change(likelihoods.message(5, errors=UNKNOWN), components=[])
     assert one.take(MIXTURE, nobody).faults == ()
 
@@ -189,13 +189,13 @@ def test_smoothed_poses_tell_state_track_and_motion(session, outputs, likelihood
         assert np.allclose(speeds, 0.5 * np.linalg.norm(swing, axis=1), rtol=0.25)
         pelvis = body.joint_names.index('pelvis')
         assert np.abs(content.joint_velocities[:, pelvis]).max() < 0.01
-    # The bent elbow keeps its number.
+    # The bent elbow keeps its identity.
     bent = [content.identities[np.argmax(content.means[:, elbow])] for content in found]
     assert len(set(bent)) == 1
 
 
 def test_a_camera_that_jumps(session, outputs, likelihoods):
-    """From one image to the next everybody is 2 m farther and turned: so are smoothed poses."""
+    """If the person is suddenly 2 m farther and turned, smoothed poses are so, too."""
     body, one = likelihoods.body, session(fixed_lag=0.5, prior=motion_prior)
     yaw = body.dof_names.index('root_z')
     for index in range(24):
@@ -229,7 +229,7 @@ def test_a_track_that_ends_and_begins_in_a_window(session, outputs, likelihoods)
 
 
 def test_an_unknown_shape_is_added_once(session, outputs, likelihoods):
-    """To what is published, whatever the number of images that have the same error."""
+    """It is added to published covariances, for any number of images with the same error."""
     one = session(publish_covariances=True)
     d = likelihoods.body.dimension
     shape = np.zeros((d, d))
@@ -251,7 +251,7 @@ def test_an_unknown_shape_is_added_once(session, outputs, likelihoods):
 
 
 def test_a_motion_passes_over_an_image_that_is_all_wrong(session, outputs, likelihoods):
-    """Its modes show somebody who faces the other way."""
+    """The image's modes face the other way."""
     yaw = likelihoods.body.dof_names.index('root_z')
     one = session(fixed_lag=1.5, prior=motion_prior)
     for index in range(30):
@@ -280,7 +280,7 @@ def test_motions_have_the_same_numbers_in_both_messages(session, outputs, likeli
         assert len(window.identities) == 2
         assert bent == pose.identities[pose.means[:, elbow].argmax()]
         assert bent == windows[LAG].identities[windows[LAG].means[:, 0, elbow].argmax()]
-    # Another window of the same track takes other numbers, another track begins with 1 again.
+    # Another window of the same track uses new identities; another track begins with 1 again.
     one.finish()
     one.take(MIXTURE, likelihoods.message(6))
     newest = trajectory_mixture_of(read(outputs, 'trajectory_mixture')[-1])
@@ -359,7 +359,7 @@ def test_a_new_body_begins_a_new_window(session, outputs, likelihoods):
     one.take(MIXTURE, likelihoods.message(0))
     handled = one.take(MIXTURE, likelihoods.message(1, other))
     assert handled.warnings == (
-        'mixtures are about another body or another track: a new window begins',
+        'mixtures belong to another body or another track: a new window begins',
     )
     assert smoothed(outputs) == [likelihoods.stamp(0)]
     # The same body once more changes nothing.
@@ -389,14 +389,14 @@ def test_nobody_in_view_ends_the_window(session, outputs, likelihoods):
     assert handled.faults == handled.warnings == ()
     stamp = likelihoods.stamp(4)
     assert handled.events == (f'nobody in view at the mixture of {stamp} ns: the window ends',)
-    # The poses that were still open, and that there are no more.
+    # The remaining poses are published, then the end of the track.
     assert smoothed(outputs) == [likelihoods.stamp(index) for index in (1, 2, 4)]
     *_, last = read(outputs, 'smoothed_pose_mixture')
     assert (len(last.components), last.kind) == (0, int(MixtureKind.SMOOTHED))
     (markers,) = read(outputs, 'trajectory_markers')
     assert {marker.action for marker in markers.markers} == {2}
     assert (one.state.status, one.state.trouble()) == ('nobody', 'nobody in view')
-    # A second one tells nothing new, and what comes after a while is no gap to bridge.
+    # A second one adds nothing, and a later message starts a new window without a gap.
     handled = one.take(MIXTURE, change(likelihoods.message(5), components=[]))
     assert handled.published == handled.events == ()
     handled = one.take(MIXTURE, likelihoods.message(14))
@@ -504,7 +504,7 @@ def test_time_that_jumps_back_begins_a_new_window(session, outputs, likelihoods)
         for index in range(4):
             assert one.take(MIXTURE, likelihoods.message(index)).faults == ()
     one.finish()
-    # A bag that is played twice gives the same twice.
+    # A bag played twice gives the same results twice.
     wanted = [likelihoods.stamp(index) for index in range(4)]
     assert smoothed(outputs) == [*wanted, *wanted]
     half = len(outputs) // 2
@@ -521,7 +521,7 @@ def test_gaps_are_bridged_and_told(session, outputs, likelihoods):
     assert (one.state.gaps, one.state.longest_gap) == (2, pytest.approx(0.7))
     one.finish()
     assert len(smoothed(outputs)) == 5
-    # Neighbours that are far away tell less.
+    # Distant neighbours reduce the variance less.
     variances = [
         pose_mixture_of(message).mixture.covariances[0].trace()
         for message in read(outputs, 'smoothed_pose_mixture')
@@ -558,7 +558,7 @@ def test_a_span_is_smoothed_on_demand(session, likelihoods):
 
 
 def test_body_in_a_message_leads_to_no_file(session, likelihoods, tmp_path):
-    """Files are read where a parameter names them, not where somebody on the network does."""
+    """Only files named by a parameter are read, not files named by a message."""
     path = tmp_path / 'own.yaml'
     path.write_text('extends: human37\n')
     message = change(likelihoods.message(0), body_model=str(path))
@@ -592,7 +592,7 @@ def test_a_camera_on_its_side_is_smoothed_as_an_upright_one(session, outputs, li
     for one, other in zip(upright, turned, strict=True):
         relative = [x.joint_positions - x.joint_positions[:, :1] for x in (one, other)]
         assert relative[1] == pytest.approx(relative[0] @ level.T, abs=1e-6)
-        # Root angles are those against the camera.
+        # Root angles are relative to the camera.
         joints = likelihoods.body.joint_positions(other.means)
         assert joints == pytest.approx(other.joint_positions, abs=1e-6)
     last = trajectories[1]
@@ -610,7 +610,7 @@ def weights_of(outputs):
 
 
 def test_motions_have_the_weights_that_the_filter_tells(session, outputs, likelihoods):
-    """Not those of the likelihood; in a window of one image, and of one each."""
+    """They are not those of the likelihood, in one window or in windows of one image each."""
     for lag in (SECONDS, 0.0):
         outputs.clear()
         one = session(fixed_lag=lag)
@@ -621,7 +621,7 @@ def test_motions_have_the_weights_that_the_filter_tells(session, outputs, likeli
         one.take(MIXTURE, likelihoods.message(index))
     one.finish()
     assert weights_of(outputs) == pytest.approx([0.3] * 6, abs=1e-9)
-    # With a lag, what later images tell counts.
+    # With a lag, later images contribute.
     outputs.clear()
     one = session()
     for index in range(6):
@@ -632,19 +632,19 @@ def test_motions_have_the_weights_that_the_filter_tells(session, outputs, likeli
 
 
 def test_messages_from_elsewhere_tell_no_chain(session, outputs, likelihoods):
-    """A mode continues those within reach, at 30 images a second; what is missing is said once."""
+    """Modes continue those within reach, at 30 images per second; one warning is given."""
     one, times = session(), [index / 3 for index in range(6)]
     handled = [one.take(MIXTURE, likelihoods.message(index, chain=False)) for index in times]
     assert [len(h.faults) for h in handled] == [0] * 6
     assert [len(h.warnings) for h in handled] == [1, 0, 0, 0, 0, 0]
-    assert 'do not tell posterior weights and ancestry' in handled[0].warnings[0]
+    assert 'have no posterior weights and ancestry' in handled[0].warnings[0]
     one.finish()
     assert smoothed(outputs) == [likelihoods.stamp(index) for index in times]
-    # Their own weights are taken. Both modes are farther apart than anybody moves.
+    # Their own weights are used. No person moves as far as from one mode to the other.
     assert weights_of(outputs) == pytest.approx([0.4] * 6, abs=1e-9)
     windows = [trajectory_mixture_of(m) for m in read(outputs, 'trajectory_mixture')]
     assert [len(window.weights) for window in windows] == [2] * len(windows)
-    # At ten a second they are not, and either may continue either.
+    # At ten per second a person can, and each mode can continue each.
     outputs.clear()
     for index in range(3, 6):
         one.take(MIXTURE, likelihoods.message(index, chain=False))
@@ -652,7 +652,7 @@ def test_messages_from_elsewhere_tell_no_chain(session, outputs, likelihoods):
 
 
 def test_a_likelihood_that_is_lost_on_the_way(session, outputs, likelihoods):
-    """Ancestry refers to an image that has not come: modes continue what is within reach."""
+    """Ancestry refers to a missing image, so modes continue those within reach."""
     one = session(longest_interval=0.5)
     for index in (0, 1, 2, 4, 5, 6):
         handled = one.take(MIXTURE, likelihoods.message(index))
@@ -667,7 +667,7 @@ def test_a_likelihood_that_is_lost_on_the_way(session, outputs, likelihoods):
 
 
 def test_modes_that_other_modes_follow(session, outputs, likelihoods):
-    """Their ancestry names modes that the image before did not have."""
+    """Their ancestry names modes that the previous image did not have."""
     one = session()
     for index in range(5):
         message = likelihoods.message(index)
@@ -679,7 +679,7 @@ def test_modes_that_other_modes_follow(session, outputs, likelihoods):
 
 
 def test_modes_that_begin_within_a_track(session, outputs, likelihoods):
-    """A lost track is found again: weights are told, and nothing that they continue."""
+    """A lost track is found again: modes have weights, but no ancestors."""
     one = session()
     for index in range(8):
         before = None if index == 4 else index - 1
@@ -691,7 +691,7 @@ def test_modes_that_begin_within_a_track(session, outputs, likelihoods):
 
 
 def test_another_number_of_modes_in_each_image(session, outputs, likelihoods):
-    """One mode, two, one: where ancestry is not told, and where a mode has no weight."""
+    """One mode, two, one: without ancestry, and with a mode without weight."""
     one = session()
     for index in range(9):
         mixture = likelihoods.mixture(index)
@@ -709,7 +709,7 @@ def test_another_number_of_modes_in_each_image(session, outputs, likelihoods):
 
 
 def test_all_modes_are_wrong_for_a_second(session, outputs, likelihoods):
-    """Somebody who faces the other way, 2 m beside: found again within a second."""
+    """They face the other way, 2 m aside; the person is found again within a second."""
     yaw = likelihoods.body.dof_names.index('root_z')
     one = session(fixed_lag=0.5, prior=motion_prior)
     for index in range(40):

@@ -1,4 +1,4 @@
-"""One stray stamp changes nothing; a clock that is set back is followed by itself."""
+"""A single stray timestamp has no effect; a clock set back is followed automatically."""
 # ruff: noqa: F811
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ STEP = SECOND_NS // 10
 
 
 def used(order, stamps, *, expected=False):
-    """The stamps that are used of some, and those that are stray."""
+    """The used and the stray ones of some timestamps."""
     result, strays = [], []
     for stamp in stamps:
         turn = order.put(Stamped(stamp, None), expected=expected)
@@ -38,7 +38,7 @@ def used(order, stamps, *, expected=False):
     st.integers(STEP // 10, 2 * SECOND_NS),
 )
 def test_a_stray_stamp_is_left_out(place, far, step):
-    # A clock that begins at a day; the stray is between two others.
+    # A clock that starts at one day; the stray timestamp is between two others.
     stamps = [24 * HOUR + k * step for k in range(25)]
     far = far if abs(far) > 6 * step else 10 * far
     stray = stamps[place] + far + 1
@@ -71,7 +71,7 @@ def test_what_is_put_aside_is_used_at_the_end_unless_it_is_older():
 def test_a_slow_stream_is_no_stray():
     stamps = [k * HOUR for k in range(1, 6)]
     assert used(StampOrder(), stamps) == (stamps, [])
-    # One that was fast before, too, whose steps are longer than any that were usual.
+    # A clock that was faster before, with steps longer than any usual ones.
     fast = [k * STEP for k in range(1, 6)]
     result, strays = used(StampOrder(), [*fast, *stamps])
     assert (result, strays) == ([*fast, *stamps], [])

@@ -65,7 +65,7 @@ def track(body):
         contacts={'left_foot': 0.75, 'right_foot': 0.25},
         velocities=None,
         vertical=None,
-        # As rounding may leave them.
+        # A value above 1 by a rounding error.
         validity=SimpleNamespace(shown={'depth': 0.25, 'track': 1.0 + 1e-15}),
     )
     tracker = SimpleNamespace(
@@ -87,7 +87,7 @@ def track(body):
 
 
 def changed(track, **of_estimate):
-    """The image with another estimate."""
+    """The track with another estimate."""
     estimate = SimpleNamespace(**{**vars(track.tracker.estimate), **of_estimate})
     tracker = SimpleNamespace(**{**vars(track.tracker), 'estimate': estimate})
     return replace(track, tracker=tracker)
@@ -124,15 +124,15 @@ def test_mixtures(track, body):
     assert np.array_equal(
         [c.log_likelihood for c in found['likelihood_mixture'].components], [-2.5, -1.5]
     )
-    # The likelihood is undiscounted, and tells how its errors last.
+    # The likelihood is undiscounted, and contains its error model.
     likelihood, posterior = found['likelihood_mixture'], found['pose_mixture']
     assert (likelihood.error_share, likelihood.error_time) == (0.25, 0.125)
     assert np.isnan([posterior.error_share, posterior.error_time]).all()
-    # So is what all images err by alike.
+    # It contains the covariance of the error common to all images.
     shape = track.tracker.estimate.likelihood.shape_covariance.reshape(-1)
     assert np.array_equal(likelihood.shape_covariance, shape)
     assert len(posterior.shape_covariance) == 0
-    # So is the chain of the modes, about which its components are.
+    # It contains the chain of the modes at its components.
     of_posterior, of_likelihood = (pose_mixture_of(x) for x in (posterior, likelihood))
     assert of_likelihood.identities.tolist() == [3, 1]
     assert of_likelihood.posterior_weights.tolist() == [0.25, 0.75]
@@ -140,7 +140,7 @@ def test_mixtures(track, body):
     assert of_likelihood.ancestry_ids.tolist() == [1, 4, 2]
     assert of_likelihood.ancestry_stamp_ns == STAMP - 1
     assert (of_posterior.posterior_weights, of_posterior.ancestry) == (None, None)
-    # The posterior tells what the cues are believed.
+    # The posterior contains the reliabilities of the cues.
     assert (posterior.cue_names, list(posterior.cue_probabilities)) == (
         ['depth', 'track'],
         [0.25, 1.0],
@@ -168,7 +168,7 @@ def test_transforms_lead_from_the_camera_to_the_segments(track, body):
 
 
 def joints_of(urdf):
-    """Root of a URDF, and (name, parent, child, type, origin, axis) of its joints, in order."""
+    """Root of a URDF, and (name, parent, child, type, origin, axis) of its joints in order."""
     robot = ET.fromstring(urdf)
     found = []
     for joint in robot.findall('joint'):
@@ -187,7 +187,7 @@ def joints_of(urdf):
 
 
 def forward_kinematics(urdf, state):
-    """Frames (4, 4) of the links of a URDF, by name, seen from its root."""
+    """Frames (4, 4) of the links of a URDF relative to its root, by name."""
     values = dict(zip(state.name, state.position, strict=True))
     root, joints = joints_of(urdf)
     frames = {root: np.eye(4)}
@@ -206,7 +206,7 @@ def forward_kinematics(urdf, state):
 
 @pytest.mark.parametrize('name', ['human32', 'human34', 'human37'])
 def test_urdf_joint_states_transforms_and_joint_positions_agree(name, track):
-    """A viewer that moves the URDF by joint states, and one that takes transforms, see the same."""
+    """The URDF moved by joint states agrees with the transforms."""
     rng = np.random.default_rng(7)
     plain = load_body(name)
     body = plain.with_segment_lengths(
@@ -251,7 +251,7 @@ def test_urdf_joint_states_transforms_and_joint_positions_agree(name, track):
         place = frames[f'anna/{segment}'] @ [*skeleton.joint_offsets[index], 1.0]
         np.testing.assert_allclose([point.x, point.y, point.z], place[:3], atol=1e-9)
         assert np.allclose(place[:3], body.joint_positions(poses[1:])[0, index], atol=1e-9)
-    # The URDF in the body is the same, with names of its own.
+    # The URDF in the body is the same, with other names.
     plain_root, plain_frames = forward_kinematics(found['body'].urdf, found['human_joint_states'])
     assert plain_root == 'lens'
     assert {f'anna/{link}' for link in plain_frames if link != 'lens'} == transforms.keys()
@@ -273,7 +273,7 @@ def test_ground(track, body):
     np.testing.assert_allclose(content.plane, [0.0, -0.8, -0.6, 1.5])
     assert (content.up_sigma, content.height_sigma) == (0.05, 0.1)
     assert content.contacts == track.tracker.estimate.contacts
-    # The feet are those of the point estimate.
+    # The feet belong to the point estimate.
     feet = found['markers'].markers[-1]
     joints = dict(
         zip(
@@ -318,7 +318,7 @@ def test_overlay_shows_the_modes(track, body):
     pixels = CAMERA.project(body.joint_positions(track.posterior.means))
     knee = body.joint_names.index('left_knee')
     red = [drawn[round(v), round(u)].astype(int) for u, v in pixels[:, knee]]
-    # Orange where the heaviest is, bluish where the others are, the fainter the lighter.
+    # The heaviest mode is orange, others are bluish and fainter if lighter.
     assert red[0][2] > red[0][0] + 100
     assert red[1][0] > red[1][2] + 10
     assert red[1][0] - red[1][2] > red[2][0] - red[2][2]

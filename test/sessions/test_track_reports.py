@@ -1,4 +1,4 @@
-"""What becomes of a track is told, once: start, loss, recovery, end, a camera that was moved."""
+"""Events of a track are reported once: start, loss, recovery, end, a moved camera."""
 
 import re
 
@@ -21,7 +21,7 @@ def one(stub_tracker, subject_file, outputs, small_camera):
 
 @pytest.fixture
 def lost(stub_tracker, monkeypatch):
-    """Stamps of images at which the track is lost."""
+    """Timestamps of images at which the track is lost."""
     stamps, step = set(), stub_tracker.step
 
     def patched(self, image, stamp, *arguments, **named):
@@ -46,7 +46,7 @@ def test_loss_and_recovery_are_told_once(one, small_camera, lost):
     assert sorted(told) == [0, 5, 8]
     assert told[0][0].startswith('track 1 starts from ')
     assert told[5] == (f'track 1 is found again at the image of {small_camera.stamp(5)} ns',)
-    # Every loss, and none but the first image of it.
+    # The first image of every loss.
     assert sorted(warned) == [2, 7]
     assert warned[2] == (
         f'track 1 is lost at the image of {small_camera.stamp(2)} ns: no mode explains 62% of '
@@ -92,7 +92,10 @@ def test_a_moved_camera_is_told_once(one, small_camera, stub_tracker):
 @pytest.mark.parametrize(
     ('flag', 'text'),
     [
-        ('gravity_contradicted', 'the lines of the scene, or the person, contradict the gravity'),
+        (
+            'gravity_contradicted',
+            'the lines of the scene, or the person, contradict the given gravity',
+        ),
         ('gravity_reversed', 'the opposite is used, [0.00, 1.00, 0.00]'),
     ],
 )
@@ -125,7 +128,7 @@ def test_what_a_dropped_image_waited_for_is_known(stub_tracker, subject_file, sm
     for index in range(first, first + 2):
         one.take(IMAGE, small_camera.image(index))
     assert one.state.held_up == 'keypoints'
-    # Computing alone is to blame for images that never came here.
+    # Only slow processing explains images that never arrived here.
     one.count_dropped(3)
     assert one.state.held_up == ''
     assert one.state.counts['dropped'] == 1 + 2 + 3
@@ -157,5 +160,5 @@ def test_what_is_needed_follows_the_parameters(stub_tracker, subject_file, small
         (('tf', 'tf_static'), False),
     ]
     one.take(CAMERA_INFO, small_camera.uncalibrated())
-    # It comes, and why it is of no use has been told.
+    # It arrives, and the reason for its rejection has been reported.
     assert ('camera_info',) not in [each.sources for each in one.needed_inputs()]

@@ -61,7 +61,7 @@ def test_backgrounds_that_are_none(tmp_path):
         path.write_bytes(data)
         with pytest.raises(ValueError, match=r'background.png: not a picture'):
             prepare_start(parameters(background_file=path))
-    # A file that is nearly all hole.
+    # A sparse file.
     with path.open('wb') as file:
         file.truncate(2**28 + 1)
     with pytest.raises(ValueError, match=r'268435457 bytes, wanted at most 268435456'):
@@ -105,6 +105,6 @@ def test_mixtures_go_before_the_subject(subject_file, body):
     assert empty.initial.stamp_ns == prepare_start(given).initial.stamp_ns
     taller = body.with_stature(1.9)
     assert prepare_start(given, mixture(body), taller).body is taller
-    # The present body is of another model: it says nothing about this one.
+    # The present body is of another model and gives no information about this one.
     other = prepare_start(parameters(body_model='human34')).body
     assert prepare_start(given, mixture(body), other).body.name == 'human37'

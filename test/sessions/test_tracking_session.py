@@ -1,4 +1,4 @@
-"""The rules of the session, with a tracker that costs nothing."""
+"""The tracking session, with a stub tracker."""
 
 from dataclasses import replace
 
@@ -52,7 +52,7 @@ def session(stub_tracker, subject_file, outputs):
 
 
 def tracked(outputs):
-    """Stamps of the images that were tracked."""
+    """Timestamps of the tracked images."""
     return [output.stamp_ns for output in outputs if output.topic == 'pose_mixture']
 
 
@@ -96,7 +96,7 @@ def test_mixtures_tell_state_track_and_identities(session, outputs, small_camera
         assert [content.track_id for content in found] == [1, 1, 1]
     ids = [content.identities.tolist() for content in mixtures_of(outputs)]
     assert ids == [[1, 77], [2, 77], []]
-    # What the cues are believed, as long as there is a track.
+    # Reliabilities of the cues, as long as there is a track.
     shown = stub_tracker.made[-1].validity.shown
     told = [dict(content.cue_probabilities) for content in mixtures_of(outputs)]
     assert told == [shown, shown, {}]
@@ -166,7 +166,7 @@ def test_uncalibrated_camera_is_told_once(session, outputs, small_camera):
         'camera_info has k[0] = 0: uncalibrated; calibrate the camera, and let its driver publish '
         'the result'
     ]
-    # Three messages that are no calibration, and two images that waited in vain.
+    # Three invalid calibrations, and two images that waited in vain.
     assert one.state.faults == {'camera_info': 5}
     assert one.state.wants == f'a calibrated camera_info; {warnings[0]}'
     one.take(CAMERA_INFO, small_camera.info(3))
@@ -195,7 +195,7 @@ def test_time_that_jumps_back_starts_the_track_anew(session, outputs, small_came
             handled = one.take(IMAGE, small_camera.image(index))
             assert handled.faults == ()
     assert len(stub_tracker.made) == 2
-    # A bag that is played twice gives the same twice.
+    # A bag played twice gives the same results twice.
     half = len(outputs) // 2
     assert outputs[:half] == outputs[half:]
     assert [output.topic for output in outputs].count('body') == 2
@@ -291,7 +291,7 @@ def test_nobody_in_view_is_told_once(session, outputs, small_camera, stub_tracke
     handled = [one.take(IMAGE, small_camera.image(index)) for index in (1, 2)]
     shown = [*MIXTURES, 'markers', 'overlay/compressed', *ROBOT]
     assert handled[0].published == tuple((topic, small_camera.stamp(1)) for topic in shown)
-    # Robots are told of every image.
+    # Robots get a message for every image.
     assert handled[1].published == tuple((topic, small_camera.stamp(2)) for topic in ROBOT)
     assert handled[0].faults == handled[0].warnings == ()
     messages = {output.topic: read(output) for output in outputs}
@@ -317,7 +317,7 @@ def test_nobody_in_view_is_told_once(session, outputs, small_camera, stub_tracke
 
 
 def seen(stub_tracker):
-    """Names of the keypoints that came with each image, None where there were none."""
+    """Names of the keypoints used with each image, None if missing."""
     return [
         None if keypoints is None else keypoints.names
         for tracker in stub_tracker.made
@@ -349,21 +349,21 @@ def test_images_wait_for_keypoints(session, small_camera, stub_tracker, outputs)
     one.take(IMAGE, small_camera.image(0))
     one.take(IMAGE, small_camera.image(1))
     assert tracked(outputs) == []
-    # None for 0: later ones have come. Nobody seen in 1: that is an answer, too.
+    # None for 0, because later ones have arrived. Nobody in 1 is an answer, too.
     one.take(KEYPOINTS, small_camera.keypoints(1, names=()))
     assert tracked(outputs) == [small_camera.stamp(0), small_camera.stamp(1)]
-    # The detector is silent: an image waits until one comes that is over 0.25 s younger.
+    # The detector is silent: an image waits until another one is more than 0.25 s newer.
     for index in (2, 3, 4):
         one.take(IMAGE, small_camera.image(index))
     assert len(tracked(outputs)) == 2
     one.take(IMAGE, small_camera.image(5))
     assert tracked(outputs)[2:] == [small_camera.stamp(2)]
-    # Too late for 2, and all that have waited since.
+    # Too late for 2 and all images that waited.
     one.take(KEYPOINTS, small_camera.keypoints(2))
     assert tracked(outputs)[3:] == []
     one.take(KEYPOINTS, small_camera.keypoints(5))
     assert tracked(outputs)[3:] == [small_camera.stamp(i) for i in (3, 4, 5)]
-    # Nobody seen is not the same as no answer.
+    # An answer without a person differs from no answer.
     assert seen(stub_tracker) == [None, (), None, None, None, JOINTS]
 
 
@@ -395,7 +395,7 @@ def test_bad_keypoints_are_told_and_not_used(
 
 
 def kept(session, source):
-    """How many messages of an input wait for their images."""
+    """Number of messages of an input that wait for their images."""
     return len(session._inputs[source]._content)
 
 
@@ -403,7 +403,7 @@ def kept(session, source):
 
 
 def masks(stub_tracker):
-    """Number of the person's pixels in the mask of each image, None where there was none."""
+    """Number of the person's pixels in the mask of each image, None without a mask."""
     return [
         None if mask is None else int(mask.sum())
         for tracker in stub_tracker.made
@@ -415,7 +415,7 @@ def masks(stub_tracker):
 def test_masks_go_with_the_image_of_their_stamp(
     session, small_camera, stub_tracker, order, outputs
 ):
-    """In whatever order they come, compressed or not; a mask without a person says so."""
+    """In any order, compressed or not; a mask without a person is an answer, too."""
     inputs = [
         (IMAGE, small_camera.image(0)),
         (COMPRESSED_MASK, small_camera.compressed_mask(0)),
@@ -438,7 +438,7 @@ def test_images_wait_for_masks(session, small_camera, stub_tracker, outputs):
     for index in (0, 1, 2):
         one.take(IMAGE, small_camera.image(index))
     assert tracked(outputs) == []
-    # An image that is over 0.25 s younger ends the wait.
+    # An image that is more than 0.25 s newer ends the wait.
     handled = one.take(IMAGE, small_camera.image(3))
     assert tracked(outputs) == [small_camera.stamp(0)]
     assert handled.warnings == (f'no mask came for the image of {small_camera.stamp(0)} ns',)
@@ -449,7 +449,7 @@ def test_images_wait_for_masks(session, small_camera, stub_tracker, outputs):
     # Too late for 1.
     one.take(MASK, small_camera.mask(1))
     (warning,) = one.take(MASK, small_camera.mask(3)).warnings
-    assert f'mask of {small_camera.stamp(1)} ns: no image has this stamp' in warning
+    assert f'mask of {small_camera.stamp(1)} ns: no image with this stamp waits' in warning
     assert masks(stub_tracker) == [None, None, 240, 240]
     assert one.state.faults == {'no mask': 2, 'mask without an image': 1}
 
@@ -491,7 +491,7 @@ def broken(message):
 def test_bad_masks_are_told_and_not_used(
     session, small_camera, stub_tracker, source, change, message, outputs
 ):
-    """The image need not wait any longer; the next mask is used."""
+    """The image waits no longer; the next mask is used."""
     one = session(use_mask=True)
     one.take(CAMERA_INFO, small_camera.info())
     handled = [one.take(IMAGE, small_camera.image(0)), one.take(source, change(small_camera))]
@@ -571,7 +571,7 @@ def test_late_filter_leaves_images_out_but_not_what_was_predicted(
     one.take(CAMERA_INFO, small_camera.info())
     left = likelihoods.nobody(3)
     left.state = int(TrackState.TRACKING)
-    # All have come during an estimate.
+    # All have arrived during an estimate.
     handled = [one.take(IMAGE, small_camera.image(index), more=True) for index in range(4)]
     for index in range(3):
         handled += [one.take(PREDICTION, likelihoods.message(index), more=True)]
@@ -593,7 +593,7 @@ def test_late_filter_leaves_images_out_but_not_what_was_predicted(
 def test_a_prediction_behind_the_pose_is_a_hypothesis_for_the_next_image(
     session, small_camera, likelihoods, stub_tracker
 ):
-    """Experts that leave an image to the track look at it once its pose is out."""
+    """Experts that skip an image predict it after its pose is published."""
     one = session(use_predictions=True)
     one.take(CAMERA_INFO, small_camera.info())
     for index, behind in enumerate([likelihoods.message(0), likelihoods.nobody(1), None]):
@@ -741,7 +741,7 @@ def test_topics_are_those_of_the_architecture():
     assert [topic for topic, published in TOPICS.items() if published.latched] == STARTS
 
 
-# What a robot acts on.
+# Messages for robots.
 
 
 def kept_out(outputs):
@@ -776,7 +776,7 @@ def test_a_camera_that_stops_makes_the_space_grow(session, outputs, small_camera
     after = keep_out_of(read(capsules))
     assert (after.state, after.unseen) == (KeepOutState.STALE, 0.2)
     assert (after.radii - last.radii).tolist() == pytest.approx([1.3] * len(last.radii))
-    # The watcher reports it; it is no answer to an image.
+    # The watcher reports it without an image.
     assert len(kept_out(outputs)) == 1
 
 
@@ -794,14 +794,14 @@ def test_an_image_that_shows_nothing_frees_nothing(session, outputs, small_camer
     one.take(CAMERA_INFO, small_camera.info())
     one.take(IMAGE, small_camera.image(0))
     (tracker,) = stub_tracker.made
-    # The posterior is a prediction, while the track has not been given up.
+    # The posterior is a prediction, as long as the track has not ended.
     tracker.estimate.foreseen = True
     one.take(IMAGE, small_camera.image(1))
-    # It can not be tracked at all.
+    # Tracking fails.
     stub_tracker.fault = ValueError('a hypothesis is not finite')
     one.take(IMAGE, small_camera.image(2))
     stub_tracker.fault, tracker.estimate.foreseen = None, False
-    # Nobody, by an earlier image: the lens is covered now.
+    # An earlier image showed nobody, and now the lens is covered.
     stub_tracker.empty |= {small_camera.stamp(3), small_camera.stamp(4)}
     one.take(IMAGE, small_camera.image(3))
     tracker.estimate.nobody_shown = False
@@ -815,7 +815,7 @@ def test_an_image_that_shows_nothing_frees_nothing(session, outputs, small_camer
 
 
 def test_a_track_of_nobody_leaves_nothing_behind(session, outputs, small_camera, stub_tracker):
-    """What it began from was a ghost: neither a place to keep out of, nor that nobody is there."""
+    """After a false start there is neither a keep-out space nor the state NOBODY."""
     one = session()
     one.take(CAMERA_INFO, small_camera.info())
     one.take(IMAGE, small_camera.image(0))
@@ -834,7 +834,7 @@ def test_a_track_of_nobody_leaves_nothing_behind(session, outputs, small_camera,
     found = kept_out(outputs)
     assert [content.state.name for content in found] == ['TRACKING', 'UNKNOWN']
     assert len(found[1].radii) == 0
-    # The start that is still given is what is awaited.
+    # The configured start is still awaited.
     assert found[1].reason.startswith('waiting for an image of')
     last = [
         pose_mixture_of(deserialise(x.data, TOPICS['pose_mixture'].msgtype))

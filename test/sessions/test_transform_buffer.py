@@ -1,4 +1,4 @@
-"""Transforms over time, against rotations of scipy; and messages that nobody should send."""
+"""Transforms over time, compared with scipy's rotations; and invalid messages."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def random_places(count, seed=0):
 
 
 def test_transforms_are_joined_along_the_tree(buffer):
-    """map - odom - base - camera, and an arm beside it."""
+    """The tree is map - odom - base - camera, with an arm as a branch."""
     rotations, places = random_places(4)
     parents = {'odom': 'map', 'base': 'odom', 'camera': 'base', 'hand': 'base'}
     matrices = {}
@@ -58,7 +58,7 @@ def test_between_stamps_is_the_shortest_arc(buffer, angle):
     last = first * Rotation.from_rotvec(angle * np.array([0.6, 0.0, 0.8]))
     buffer.put(message('world', 'camera', first, (1.0, 2.0, 3.0)), static=False)
     other = message('world', 'camera', last, (2.0, 0.0, 3.0), START + SECOND)
-    # The same rotation, with the signs turned round.
+    # The same rotation with inverted signs.
     q = other.transforms[0].transform.rotation
     q.x, q.y, q.z, q.w = -q.x, -q.y, -q.z, -q.w
     buffer.put(other, static=False)
@@ -84,7 +84,7 @@ def test_order_of_arrival_does_not_matter(buffer):
 def test_a_frame_that_changes_its_parent(buffer):
     buffer.put(message('left', 'box', None, (1, 0, 0), START), static=False)
     buffer.put(message('right', 'box', None, (2, 0, 0), START + SECOND), static=False)
-    # Between the two it is where it was, as in tf2.
+    # Between the two messages it is at its last place, as in tf2.
     found = buffer.lookup('left', 'box', START + SECOND // 2)
     np.testing.assert_allclose(found.translation, [1, 0, 0])
     np.testing.assert_allclose(buffer.lookup('right', 'box', START + SECOND).translation, [2, 0, 0])
@@ -115,7 +115,7 @@ def test_time_that_jumps_back(buffer):
     assert not buffer.has_later(START, SECOND)
     with pytest.raises(TransformError):
         buffer.lookup('world', 'camera', START + 2 * SECOND)
-    # A bag that begins again needs nobody to say so.
+    # A restarted bag is detected without a signal.
     for k in (100, 99):
         buffer.put(message('world', 'camera', None, (9, 0, 0), START - k * SECOND), static=False)
     assert buffer.lookup('world', 'camera', START - 100 * SECOND).translation[0] == 9
@@ -190,7 +190,7 @@ def test_frames_that_are_not_connected(buffer):
 def test_frames_in_a_loop(buffer):
     for parent, child in (('a', 'b'), ('b', 'c'), ('c', 'a')):
         buffer.put(message(parent, child), static=True)
-    # Those in the loop can be reached; what lies elsewhere can not, and is not sought for ever.
+    # Frames in the loop are reachable; others are not, and the search ends.
     buffer.lookup('a', 'c', START)
     buffer.put(message('world', 'd'), static=True)
     with pytest.raises(TransformError, match='the frames c, b, a, c form a loop'):

@@ -1,4 +1,4 @@
-"""Small sequences with posteriors that are known exactly."""
+"""Small sequences with exactly known posteriors."""
 
 from __future__ import annotations
 
@@ -96,8 +96,8 @@ def make_chained(
     """Images of a filter whose modes have the weights of the mixtures.
 
     Args:
-        stamps: ns; None: a second apart.
-        hops: probability that a mode continues each of the others, where `origins` are not told.
+        stamps: timestamps, ns; None means a second apart.
+        hops: probability that a mode continues each of the others, if `origins` are not given.
     """
     result = []
     for t, mixture in enumerate(mixtures):
@@ -114,7 +114,7 @@ def make_dense(mixtures, path, dynamics, intervals, first=None):
     """Means (T, n) and covariances (T, n, T, n) of the states along modes, by dense algebra.
 
     Args:
-        first: mean and precision of the first state; None: those of the dynamics.
+        first: mean and precision of the first state; None means those of the dynamics.
     """
     times, n, d = len(path), dynamics.state_dimension, dynamics.dimension
     precision, pull = np.zeros((times, n, times, n)), np.zeros((times, n))

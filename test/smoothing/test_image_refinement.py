@@ -27,7 +27,7 @@ INDEPENDENT = CueErrors(1.0, 0.0)
 
 @dataclass(frozen=True)
 class TwoWells:
-    """E = s (x^2 - 1)^2 / 8 at every time: minima at -1 and 1, of curvature s."""
+    """E = s (x^2 - 1)^2 / 8 at every time, with minima at -1 and 1 of curvature s."""
 
     sharpness: float
     times: int = TIMES
@@ -43,7 +43,7 @@ class TwoWells:
 
 
 def chain(places, weights, sigma=0.1):
-    """Modes (K, d) that stay where they are, each of which continues itself."""
+    """Constant modes (K, d), each of which continues itself."""
     places = np.asarray(places, dtype=float)
     count, d = places.shape
     result = []
@@ -75,7 +75,7 @@ def test_optima_of_a_symmetric_likelihood_have_the_same_weight(adapt):
     )
     np.testing.assert_allclose(found.weights, 0.5, atol=0.02)
     np.testing.assert_allclose(found.log_joint[0], found.log_joint[1], atol=0.02)
-    # That of an image is 0.05, of modes 0.1; neighbours tell of each other.
+    # The deviation of an image is 0.05, of modes 0.1; neighbouring images reduce it.
     spread = np.sqrt(found.marginal_covariances[:, TIMES // 2, 0, 0])
     assert ((spread > 0.02) & (spread < 0.05)).all()
     assert len(found.free_energy) >= 1
@@ -121,7 +121,7 @@ def test_as_many_images_as_times_are_wanted():
 
 
 def test_both_flips_of_an_arm_are_optima_of_the_keypoints():
-    """The person is far away: the arm towards the camera and away from it have one image."""
+    """The person is far away, so arms towards and away from the camera look the same."""
     body = load_body('human37')
     camera = Camera(9000.0, 9000.0, 319.5, 239.5, 640, 480)
     likelihood = ImageLikelihood(body, camera)

@@ -1,4 +1,4 @@
-"""The images themselves as observations: energies as the filter has them, and a walk smoothed."""
+"""Images as observations: the same energies as in the filter, and a smoothed walk."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def walk():
 
 @pytest.fixture(scope='module')
 def believed(walk):
-    """A filter's energies, and the images with silhouettes and beliefs, before a known floor."""
+    """A filter's energies, and images with silhouettes and reliabilities, with a known floor."""
     body, sequence, poses = walk
     ground = GroundEstimator(KnownGround(np.array([0.0, -1.0, 0.0]), 1.1))
     posterior = Posterior(body, CAMERA, TrackerSettings(), ground=ground)
@@ -86,7 +86,7 @@ def test_energies_are_those_by_which_the_filter_weighs(walk, believed):
 
 
 def test_derivatives_are_those_of_the_energy(walk, believed):
-    # Of keypoints and priors: the points of a contour slide along the flesh as the pose changes.
+    # Only keypoints and priors, because contour points slide along the flesh with the pose.
     body, sequence, poses = walk
     images = [replace(one, known=believed[0].known(one.observation)) for one in sequence.images]
     sequence = ImageSequence.of(images, STAMPS)

@@ -1,4 +1,4 @@
-"""The smoother against exact posteriors, and what it refuses; the mixture it returns."""
+"""The smoother, compared with exact posteriors; refused input; the returned mixture."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ def test_not_a_number_is_refused_where_it_comes_in():
 
 
 def test_what_counts_of_an_observation_is_a_power_of_it():
-    """Where modes are apart, log q = a log p up to a constant, near either of them."""
+    """For distant modes, log q = a log p up to a constant, near each of them."""
     spread = np.array([[0.5, 0.2], [0.2, 0.3]])
     means = np.array([[-9.0, 0.0], [9.0, 4.0]])
     mixture = GaussianMixture([0.9, 0.1], means, [spread, 0.2 * spread])
@@ -212,7 +212,7 @@ def test_what_counts_of_an_observation_is_a_power_of_it():
         assert found.weights.sum() == pytest.approx(1.0)
         offset = found.log_density(points) - share * mixture.log_density(points)
         np.testing.assert_allclose(offset, offset[0], atol=1e-6)
-    # A mode without weight stays without; one that hardly has any comes nearer.
+    # A mode without weight gets none; one with little weight gets more.
     light = counted(GaussianMixture([1.0, 1e-300, 0.0], [[0.0], [1.0], [2.0]], [[[1.0]]] * 3), 0.1)
     np.testing.assert_allclose(light.weights, [1.0, 1e-30], rtol=1e-9)
     for share in (0.0, -0.5, 1.5):
@@ -221,7 +221,7 @@ def test_what_counts_of_an_observation_is_a_power_of_it():
 
 
 def test_parts_of_a_long_sequence_lead_to_the_same_optima(modes):
-    """Refined first where paths leave the best one, or at once."""
+    """Refined first in parts that differ from the best path, or as a whole."""
     mixtures = tuple(modes(2.0, times=LONG + 20))
     dynamics = LinearGaussianDynamics.random_walk([0.5, 0.5])
     sequence = ModeSequence(mixtures, dynamics, np.ones(len(mixtures) - 1))
@@ -233,7 +233,7 @@ def test_parts_of_a_long_sequence_lead_to_the_same_optima(modes):
     shared = sequence.paths(9).nodes == sequence.paths(9).nodes[0]
     starts = np.where(shared[:, :, None], best.states, starts)
     whole = refine(starts, sequence.prior, sequence.likelihood, -9.0, 9.0).without_duplicates()
-    # A minimum is found to 1e-6 nats, which is this far in units of its deviations.
+    # A minimum is found to 1e-6 nats, which corresponds to this share of a deviation.
     np.testing.assert_allclose(found.states[: len(whole)], whole.states, atol=5e-3)
 
 

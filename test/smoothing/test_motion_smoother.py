@@ -1,4 +1,4 @@
-"""States along motions against dense algebra, what they leave out, and what is refused."""
+"""States along motions, compared with dense algebra, and refused input."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_one_mode_at_each_time_is_a_kalman_smoother(modes, walk, chained, dense,
 
 
 def test_errors_that_last_count_once(modes, chained, dense):
-    """Covariances S / b in the smoother, and the factor of what stays on what is told."""
+    """Covariances S / b in the smoother, and the factor for constant errors on the output."""
     mixtures = [mixture[:1].normalised() for mixture in modes(1.0)]
     found = MotionSmoother(FAST).smooth(chained(mixtures, STAMPS, errors=LASTING))
     intervals = [np.inf, *np.diff(UNEVEN)]
@@ -63,7 +63,7 @@ def test_errors_that_last_count_once(modes, chained, dense):
 
 
 def test_modes_of_one_motion_are_one_gaussian_that_contains_them(chained, dense):
-    """Two modes 10 mm apart: their mean is smoothed, what they differ by stays in marginals."""
+    """Two modes 10 mm apart: their mean is smoothed, marginals include their difference."""
     walk = LinearGaussianDynamics.random_walk([0.01])
     spread = 1e-6
     mixtures = [GaussianMixture([0.5, 0.5], [[0.0], [0.01]], [[[spread]]] * 2)] * 9
@@ -77,14 +77,14 @@ def test_modes_of_one_motion_are_one_gaussian_that_contains_them(chained, dense)
 
 
 def test_motions_have_the_weight_of_all_their_paths(modes, walk, chained, monkeypatch):
-    """Far apart, each path is a motion; where less are wanted, weights still sum to one."""
+    """Each of several distant paths is a motion; with fewer motions weights still sum to one."""
     monkeypatch.setattr(motion_smoother, 'LEAST', 0.0)
     images = chained(modes(3.0, times=3), hops=0.2)
     found = MotionSmoother(walk, max_motions=27).smooth(images)
     assert len(found) > 8
     oldest = backward_weights([image.link for image in images])[0]
     first = np.abs(found.means[:, 0, None] - images[0].mixture.means).sum(2).argmin(1)
-    # The states of a path begin near the mode where it begins.
+    # The states of a path start near its first mode.
     np.testing.assert_allclose(np.bincount(first, found.weights), oldest, atol=0.02)
     few = MotionSmoother(walk, max_motions=2).smooth(images)
     assert len(few) == 2
@@ -103,7 +103,7 @@ def test_limits_hold_for_means_and_samples(modes, walk, chained):
 
 @pytest.mark.parametrize('factor', [1.0, 4.0])
 def test_a_motion_that_is_livelier_is_followed(chained, factor):
-    """In the time of the prior's, and in a quarter of it; images show it to 0.1 m."""
+    """A motion is faster than the prior; images measure it to 0.1 m."""
     dynamics = LinearGaussianDynamics.constant_velocity([0.5], 0.5)
     times = np.arange(45) / 30
     place = 0.3 * np.sin(np.pi * factor * times)
@@ -116,7 +116,7 @@ def test_a_motion_that_is_livelier_is_followed(chained, factor):
 
 
 def test_a_wrong_image_is_passed_over_and_does_not_come_back(chained):
-    """One image shows somewhere else: neither its window nor those after it go there."""
+    """One image shows another place: neither its window nor later ones follow it."""
     dynamics = LinearGaussianDynamics.constant_velocity([0.5], 0.5)
     places = np.where(np.arange(40) == 12, 0.9, 0.0)
     images = chained(
@@ -170,7 +170,7 @@ def test_joint_densities_are_those_of_prior_and_images(modes, chained, known):
 
 
 def test_one_image(modes, walk, chained):
-    """Every mode of one image is a motion; there is nothing to absorb."""
+    """Every mode of one image is a motion; nothing is merged."""
     (image,) = chained(modes(2.0, times=1))
     found = MotionSmoother(walk).smooth([image])
     order = np.argsort(-image.link.weights, kind='stable')
@@ -182,7 +182,7 @@ def test_one_image(modes, walk, chained):
 
 
 def test_two_thousand_images_of_two_modes(chained, rng):
-    """A minute of 37 variables at once: seconds, and far below a gigabyte."""
+    """A minute of 37 variables in one window takes seconds and far less than a gigabyte."""
     d, count = 37, 2000
     dynamics = LinearGaussianDynamics.constant_velocity(np.full(d, 0.5), 0.5)
     covariances = np.tile(1e-3 * np.eye(d), (2, 1, 1))
@@ -233,12 +233,12 @@ def test_stamps_that_do_not_increase_are_refused(modes, walk, chained):
 
 
 def as_limbs(poses: np.ndarray) -> np.ndarray:
-    """One point a pose, at its first variable, m."""
+    """One point per pose, at its first variable, m."""
     return np.stack([poses[:, 0], 0.0 * poses[:, 0], 0.0 * poses[:, 0]], axis=1)[:, None]
 
 
 def jumping(chained, places, **kwargs):
-    """Images of one mode, at places (T,) of a walk along one variable, 30 a second."""
+    """Images of one mode at positions (T,) along one variable, 30 per second."""
     mixtures = [GaussianMixture([1.0], [[x]], [[[4e-4]]]) for x in places]
     stamps = [round(1e9 * t / 30) for t in range(len(places))]
     walk = LinearGaussianDynamics.random_walk([3e-3])
@@ -246,9 +246,9 @@ def jumping(chained, places, **kwargs):
 
 
 def test_states_follow_where_the_chain_goes_over_to_another_pose(chained):
-    """Before it and after it they are near the modes; a single image is passed over."""
+    """Before and after the change they are near the modes; a single image is ignored."""
     found = jumping(chained, [0.0] * 8 + [0.8] * 8)
-    # From a tenth of a second before it, and after it.
+    # From a tenth of a second before and after the change.
     np.testing.assert_allclose(found.means[0, :5, 0], 0.0, atol=0.02)
     np.testing.assert_allclose(found.means[0, 11:, 0], 0.8, atol=0.02)
     alone = jumping(chained, [0.0] * 8 + [0.8] + [0.0] * 7)
@@ -256,7 +256,7 @@ def test_states_follow_where_the_chain_goes_over_to_another_pose(chained):
 
 
 def test_modes_that_are_opposite_are_no_one_gaussian(chained):
-    """A motion keeps its pose in an image where a third of its paths pass another, far away."""
+    """A motion keeps its pose in an image in which a third of its paths have a distant one."""
     mixtures, stamps = [], [round(1e9 * t / 30) for t in range(16)]
     for t in range(16):
         both = [[0.0], [0.8]] if t == 8 else [[0.0], [0.0]]
@@ -267,7 +267,7 @@ def test_modes_that_are_opposite_are_no_one_gaussian(chained):
     assert len(found) == 1
     assert np.abs(found.means[0, :, 0]).max() < 0.05
     assert found.disagreements[0, 8, 0, 0] < 1e-3
-    # The density of that image knows of it, and the motion leads all the same.
+    # The density of that image includes the other pose, and the motion stays heaviest.
     marginal = found.marginal(8)
     assert marginal.means[1:, 0].tolist() == [0.8]
     stray = backward_weights([x.link for x in chained(mixtures, stamps, hops=0.5)])[8][1]
@@ -276,7 +276,7 @@ def test_modes_that_are_opposite_are_no_one_gaussian(chained):
 
 
 def test_motions_weigh_what_the_modes_near_them_do(chained):
-    """At every time, whatever the number of paths is that were drawn."""
+    """At every time, for any number of drawn paths."""
     mixtures = [GaussianMixture([0.55, 0.45], [[0.0], [0.4]], [[[1e-4]]] * 2)] * 16
     stamps = [round(1e9 * t / 30) for t in range(16)]
     images = chained(mixtures, stamps, hops=0.03)

@@ -1,4 +1,4 @@
-"""Motions: distances of paths by their definition, what flickers, and moments of the evidence."""
+"""Motions: distances of paths by definition, short differences, and evidence moments."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def rng():
 
 
 def by_definition(nodes, points, stamps):
-    """Equation (1), one pair, span and joint at a time; a moment ends at every span.
+    """Equation (1) by loops over pairs, spans and joints, with the maximum over spans.
 
-    And the mean over all spans, without a limit.
+    Also returns the mean over all spans, without a limit.
     """
     ages = [(stamps[-1] - stamp) * 1e-9 for stamp in stamps]
     of_span = [int(np.floor(age / SPAN + 1e-3)) for age in ages]
@@ -79,7 +79,7 @@ def test_distances_are_those_of_the_definition(rng, stamps):
 
 
 def two_paths(images, away, some):
-    """Distance of two paths that are `away` apart in some of the images, and one elsewhere."""
+    """Distance of two paths that differ by `away` in some images and are equal in others."""
     points = [np.array([[[0.0, 0.0, 0.0]], [[away, 0.0, 0.0]]])] * images
     nodes = np.zeros((2, images), dtype=np.intp)
     nodes[1, list(some)] = 1
@@ -90,9 +90,9 @@ def two_paths(images, away, some):
 @pytest.mark.parametrize('images', [14, 16, 17, 18, 19, 45, 60])
 @pytest.mark.parametrize('away', [0.05, 0.1, 0.15, 9.0])
 def test_what_flickers_is_absorbed(images, away):
-    """For less than a tenth of a second, 150 mm away; in one span, however far.
+    """A path 150 mm away for less than 0.1 s, or at any distance within one span, is merged.
 
-    But for the oldest images of a window, which are less than a span: a motion may end there.
+    The oldest images of a window, less than a span, are an exception: a motion may end there.
     """
     newest = [range(images - 5 * k - 5, images - 5 * k) for k in range(images // 5)]
     for first in range(images % 5, images - 1):
@@ -103,10 +103,10 @@ def test_what_flickers_is_absorbed(images, away):
 
 @pytest.mark.parametrize('images', [16, 17, 18, 19, 60])
 def test_two_that_part_and_meet_again_are_two(images):
-    """For 0.3 s, by 150 mm, at any time."""
+    """They differ by 150 mm for 0.3 s, at any time."""
     for first in range(images - 8):
         assert two_paths(images, 0.15, range(first, first + 9)) > SAME_MOTION
-    # A difference that is less, all along, is one motion.
+    # With a smaller constant difference they are one motion.
     assert (
         two_paths(images, 0.029, range(images))
         <= SAME_MOTION
@@ -124,17 +124,17 @@ def test_motions_are_numbered_by_weight_and_have_all_of_it():
     distances = np.abs(places[:, None] - places)
     found = grouped(weights, distances, distances, most=8, least=0.02)
     assert found.tolist() in ([2, 1, 1, 0, 0, 0, 3], [3, 1, 1, 0, 0, 0, 2])
-    # Of two that there may be, the heaviest; all others belong to the nearer one.
+    # At most two motions, the heaviest; all other paths belong to the nearer one.
     found = grouped(weights, distances, distances, most=2, least=0.02)
     assert found.tolist() == [1, 1, 1, 0, 0, 0, 1]
     np.testing.assert_allclose(np.bincount(found, weights), [0.55, 0.45])
     assert set(grouped(weights, distances, distances, most=8, least=0.0)) == set(range(5))
-    # The first leads whatever it has.
+    # The first path is always a motion.
     assert set(grouped(weights, distances, distances, most=8, least=0.9)) == {0}
 
 
 def test_a_path_that_is_no_motion_belongs_to_what_it_is_near_for_longer():
-    """It is of the second for a second and of the third for another; never of the first."""
+    """It belongs to the second path for a second, then to the third, never to the first."""
     points = [np.array([[[0.0] * 3], [[1.0] * 3], [[2.0] * 3]])] * 60
     nodes = np.zeros((4, 60), dtype=np.intp)
     nodes[1], nodes[2], nodes[3, :35], nodes[3, 35:] = 1, 2, 1, 2
@@ -146,7 +146,7 @@ def test_a_path_that_is_no_motion_belongs_to_what_it_is_near_for_longer():
 
 
 def test_what_flickers_far_away_does_not_leave_its_motion():
-    """For a sixth of a second 1 m away; another motion, on that side, is 40 mm away all along."""
+    """It is 1 m away for 1/6 s; another motion on that side is always 40 mm away."""
     points = [np.array([[[0.0, 0.0, 0.0]], [[0.04, 0.0, 0.0]], [[1.0, 0.0, 0.0]]])] * 16
     nodes = np.zeros((3, 16), dtype=np.intp)
     nodes[1], nodes[2, 6:11] = 1, 2

@@ -1,4 +1,4 @@
-"""The embedded network against closed forms, its paths against enumeration."""
+"""The embedded network against closed forms, and its paths against enumeration."""
 
 from __future__ import annotations
 

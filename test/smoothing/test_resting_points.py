@@ -1,4 +1,4 @@
-"""Points that rest: a chain of two states, against enumeration, and what it adds to a prior."""
+"""Resting points: a chain of two states, compared with enumeration, and its prior terms."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_a_direction_that_is_known_badly_may_seem_to_move_more():
         return line(poses)[..., [1, 0, 2]]
 
     def of_across(poses):
-        # The first coordinate of the point is known badly and stands still.
+        # The first coordinate of the point is uncertain and constant.
         result = of_line(poses)[:, :, [1, 0, 2]]
         result[:, 0, 0, 0] = 100.0
         return result
@@ -103,7 +103,7 @@ def test_the_prior_costs_what_resting_points_slip(rng):
     slips = np.diff(line(states[:, :, :2].reshape(-1, 2)).reshape(3, 5, 3), axis=1)
     wanted = (rests[:, 0] * np.square(slips).sum(2) / (2.0 * SLIP * intervals)).sum(1)
     more = held.energy(states)[0] - prior.energy(states)[0]
-    # Up to the constant that a Gaussian leaves out.
+    # Up to the normalisation constant of a Gaussian.
     np.testing.assert_allclose(more - more[0], wanted - wanted[0], rtol=1e-9)
 
 
@@ -125,7 +125,7 @@ def test_a_body_without_feet_has_nothing_that_rests(monkeypatch):
 
 @pytest.mark.parametrize('speed', [0.0, 1.0])
 def test_a_smoother_holds_what_rests(rng, chained, speed):
-    """What trembles on a spot stands still; what moves goes where it went without."""
+    """Jittering points are held at rest; moving ones keep their motion."""
     dynamics = LinearGaussianDynamics.random_walk([0.5, 0.5])
     stamps = [round(t * DT * 1e9) for t in range(40)]
     way = speed * DT * np.arange(40)

@@ -1,4 +1,4 @@
-"""The sliding window: exact smoothing, identities, lag, and what it refuses."""
+"""The sliding window: exact smoothing, identities, lag, and refused input."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def every(seconds, count):
 
 @pytest.mark.parametrize('moving', [True, False])
 def test_final_marginals_are_those_given_what_the_lag_saw(modes, walk, chained, dense, moving):
-    """Three modes that each go on as themselves: three Gaussians, by dense algebra."""
+    """Three modes that continue independently: three Gaussians, by dense algebra."""
     dynamics, mixtures = FAST if moving else walk, modes(2.0, times=8)
     stamps = np.cumsum([0, 7, 10, 12, 9, 10, 8, 11]) * 10**8
     _, final = run(SlidingWindow(MotionSmoother(dynamics), 2.2), chained(mixtures, stamps))
@@ -49,7 +49,7 @@ def test_final_marginals_are_those_given_what_the_lag_saw(modes, walk, chained, 
 
 @pytest.mark.parametrize('moving', [True, False])
 def test_velocities_of_final_poses(walk, chained, moving):
-    """A point moves by (2, -1) a second; a state with a velocity takes it to rest at first."""
+    """A point moves by (2, -1) per second; a state with velocity assumes rest at first."""
     chosen = FAST if moving else walk
     places = np.array([2.0, -1.0]) * np.arange(8)[:, None]
     images = chained([GaussianMixture([1.0], [place], [1e-4 * np.eye(2)]) for place in places])
@@ -58,7 +58,7 @@ def test_velocities_of_final_poses(walk, chained, moving):
         tolerance = 0.8 * 0.4**t if moving else 0.0
         np.testing.assert_allclose(pose.velocities, [[2.0, -1.0]], atol=0.02 + tolerance)
         assert pose.identities == (1,)
-    # Of one pose alone nothing is known.
+    # One pose gives no velocity.
     _, (alone,) = run(SlidingWindow(MotionSmoother(walk), fixed_lag=3), images[:1])
     assert alone.velocities is None
 
@@ -93,7 +93,7 @@ def test_what_is_final_is_not_revised_and_the_window_does_not_grow(modes, chaine
 
 
 def test_motions_keep_their_identity(walk, chained):
-    """Two modes far apart in changing order: two trajectories, followed over many windows."""
+    """Two distant modes in changing order give two trajectories over many windows."""
     rng = np.random.default_rng(0)
     window = SlidingWindow(MotionSmoother(walk), fixed_lag=3)
     orders = [rng.permutation(2) for _ in range(10)]
@@ -120,7 +120,7 @@ def test_a_motion_that_splits_goes_on_as_the_heavier_part(walk, chained):
         [
             GaussianMixture([1.0], [place], sharp),
             GaussianMixture([0.3, 0.7], [left, right], 2 * sharp),
-            # Later the other one is the heavier, and both keep their numbers.
+            # Later the other mode is heavier, and both keep their identities.
             GaussianMixture([0.9, 0.1], [left, right], 2 * sharp),
         ],
         origins=[np.empty((1, 0)), np.ones((2, 1)), np.eye(2)],
@@ -136,7 +136,7 @@ def test_a_motion_that_splits_goes_on_as_the_heavier_part(walk, chained):
 
 
 def test_a_motion_that_is_revised_by_more_than_the_bound_is_another_one(chained):
-    """The points that a motion is seen by decide, not its variables."""
+    """The bound applies to the points of a motion, not to its variables."""
     dynamics = LinearGaussianDynamics.random_walk([1.0])
     images = chained(
         [GaussianMixture([1.0], [[0.0]], [[[1.0]]]), GaussianMixture([1.0], [[1.0]], [[[0.1]]])]
@@ -145,7 +145,7 @@ def test_a_motion_that_is_revised_by_more_than_the_bound_is_another_one(chained)
         smoother = MotionSmoother(dynamics, points=lambda x, s=scale: s * x[..., None])
         window = SlidingWindow(smoother, 3.0)
         window.step(images[0])
-        # The pose before moves by half a metre of its variable.
+        # The previous pose is revised by half a metre in its variable.
         found = window.step(images[1]).trajectories
         assert found.means[0, 0, 0] == pytest.approx(1.0 / 2.1, abs=0.02)
         assert found.identities == wanted
@@ -175,7 +175,7 @@ def test_the_same_observations_give_the_same_numbers(modes, walk, chained):
 
 
 def test_lag_zero_is_a_filter(modes, walk, chained, dense):
-    """Nothing is absorbed: every mode is a motion, with the weight that the filter gives it."""
+    """Nothing is merged: every mode is a motion with the filter's weight."""
     mixtures = modes(3.0, times=4)
     updates, final = run(SlidingWindow(MotionSmoother(walk), 0.0), chained(mixtures))
     assert all(len(update.final) == 1 for update in updates)
@@ -229,7 +229,7 @@ def test_poses_are_final_before_they_are_older_than_the_lag(modes, chained, inte
         final += update.final
         if t > 7:
             found |= {round((stamps[t] - pose.stamp_ns) * 1e-9, 3) for pose in update.final}
-    # At 0.9 s the one before is already too old when the next comes, and is told at once then.
+    # At 0.9 s the previous image is already too old when the next one arrives.
     assert found == {age}
     final += window.finish()
     assert [pose.stamp_ns for pose in final] == stamps
@@ -279,7 +279,7 @@ def test_neighbours_are_smoothed_together(modes, chained):
     assert [pose.stamp_ns for _, pose in always] == stamps
     ages = [(stamps[t] - pose.stamp_ns) / 1e9 for t, pose in rarely]
     assert 0.3 < max(ages) <= 0.4 + 1e-6
-    # Those that wait know more, and those that do not know the same.
+    # Delayed poses use more images; the others are the same.
     for (_, one), (_, other) in zip(always, rarely, strict=True):
         near = np.abs(one.mixture.mean() - other.mixture.mean())
         assert near.max() < 3.0 * np.sqrt(np.diag(one.mixture.covariance()).max())

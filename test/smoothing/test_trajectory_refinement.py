@@ -1,4 +1,4 @@
-"""Refined trajectories against dense optimisers, limits by their conditions, and the hard cases."""
+"""Refined trajectories, compared with dense optimisers; limits, and hard cases."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def test_what_one_trajectory_finds_does_not_depend_on_the_others(modes, walk):
 
 @dataclass(frozen=True)
 class Bearings:
-    """Angles under which a point is seen, with value, gradient and Gauss-Newton Hessian."""
+    """Bearings of a point as evidence, with value, gradient and Gauss-Newton Hessian."""
 
     angles: np.ndarray
     sigma: float = 0.02

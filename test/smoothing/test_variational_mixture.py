@@ -1,4 +1,4 @@
-"""The free energy: its gradient, its descent, and what it bounds."""
+"""The free energy: its gradient, its descent, and the bounded quantity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small body, a camera, a motion before it, its joints in the image, films, and modes."""
+"""A small body, a camera, a motion in front of it, keypoints, films and modes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tracker where nobody is: a person leaves and returns, nobody comes, images show nothing."""
+"""The tracker without a person: a person leaves and returns, or images show nothing."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker, TrackerSe
 
 FRAME = 100_000_000  # ns
 SETTINGS = TrackerSettings(candidates=8, max_hypotheses=4, searched_chains=1, estimate_shape=False)
-# As little search as there can be, for what depends on existence alone.
+# Minimum search, for tests of existence only.
 QUICK = replace(SETTINGS, candidates=2, max_hypotheses=2, searched_chains=0)
 TRACKING, LOST, NOBODY = Status.TRACKING, Status.LOST, Status.NOBODY
 NO_KEYPOINTS = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
@@ -32,7 +32,7 @@ def film(filmed, camera):
 
 @pytest.fixture(scope='module')
 def tracked(film, human32, camera):
-    """Function (images, given with each) -> statuses, track numbers, components, the tracker."""
+    """Function (images, other inputs) -> statuses, track numbers, components, the tracker."""
 
     def run(
         images, inputs=lambda i: {}, background=True, settings=SETTINGS, start=None, stamps=None
@@ -85,20 +85,20 @@ def test_a_person_leaves_and_returns(film, tracked, human32):
         [*images[:5], *nothing(film, 'empty', 10), *images[:10]]
     )
     assert statuses[:5] == [TRACKING] * 5
-    # Nobody is there 0.4 s after the last image of the person, which is number 4.
+    # NOBODY is reported 0.4 s after the last image of the person, number 4.
     assert statuses[5:15] == [TRACKING] + [LOST] * 2 + [NOBODY] * 7
     assert statuses[15:] == [NOBODY] * 3 + [TRACKING] * 7
     assert tracks == [1] * 18 + [2] * 7
     assert [count > 0 for count in components] == [x is not NOBODY for x in statuses]
-    # Of the old track the lengths are kept.
+    # The lengths of the old track are kept.
     assert tracker.estimate.body.segment_lengths == human32.segment_lengths
-    # A silhouette alone does not tell the pose at once, but the place.
+    # A silhouette alone determines the position at once, but not the pose.
     assert np.abs(tracker.estimate.posterior.means[0, :3] - poses[9][:3]).max() < 0.3
 
 
 @pytest.mark.parametrize('evidence', ['silhouettes', 'keypoints'])
 def test_after_hours_somebody_else_comes(film, tracked, human32, keypoints_of, evidence):
-    """A minute without images does not end who somebody is; three hours do."""
+    """After a minute without images the person is the same, after three hours another."""
     poses, images, _ = film
     long = dict(human32.segment_lengths) | {'thigh': 0.52}
     subject = Subject(0, keypoints_of(human32, poses[0]), long)
@@ -123,7 +123,7 @@ def test_after_hours_somebody_else_comes(film, tracked, human32, keypoints_of, e
 
 @pytest.mark.parametrize('kind', ['black', 'noise', 'white'])
 def test_images_of_nothing_are_no_empty_scene(film, tracked, kind):
-    """A covered lens, noise and a flash, each for two seconds: the same person afterwards."""
+    """After two seconds of a covered lens, noise or flash, the person is the same."""
     statuses, tracks, components, tracker = tracked(
         [*film[1][:5], *nothing(film, kind, 20), *film[1][5:10]]
     )
@@ -146,13 +146,13 @@ def test_what_is_not_seen_moves_on_and_gets_wider(film, tracked):
     volumes = [np.linalg.slogdet(x.covariances)[1] for x in (before, first, second)]
     assert (np.diff(volumes, axis=0) > 0).all()
     assert np.array_equal(first.weights, before.weights)
-    # Each component is the same mode. Poses of this body walk randomly: the best guess stays.
+    # Each component is the same mode. Poses are random walks, so the best prediction is constant.
     assert np.array_equal(tracker.estimate.origins, np.eye(len(second)))
     assert np.array_equal(tracker.estimate.point_estimate, point)
-    # Such an image says nothing of where the person is.
+    # Such an image has no information on the person's position.
     depth = likelihood.covariances[:, 2, 2]
     assert (depth > 1.0).all()
-    # What follows is the same person.
+    # The next image shows the same person.
     again, _ = tracker.step(film[1][5], 6 * FRAME)
     assert (tracker.estimate.status, tracker.track_id) == (LOST, 1)
     again, _ = tracker.step(film[1][6], 7 * FRAME)
@@ -192,7 +192,7 @@ def test_a_gap_is_no_absence_until_an_image_says_so(film, tracked):
 
 @pytest.mark.parametrize('closer', [0.5, -0.7])
 def test_two_persons_cross(tracked, human32, camera, closer):
-    """Somebody walks by before or behind the person; the track survives."""
+    """Another person passes in front of or behind the person; the track survives."""
     view = Viewpoint(distance=3.2)
     scene, other = Scene(viewpoint=view, seed=2), Scene(viewpoint=view, seed=7)
     poses = procedural_motion('reach', human32, 2.0, 10.0, 3, viewpoint=view)
@@ -222,9 +222,9 @@ def keypoint_inputs(film, human32, keypoints_of, seen):
 
 
 def test_a_detector_sees_nobody(film, tracked, human32, keypoints_of):
-    """There is no background, and the scene is grey: nothing else knows.
+    """There is no background and the scene is grey, so the detector is the only cue.
 
-    A detector that is silent may fail for longer than a silhouette is wrong: it takes 0.8 s.
+    Detectors fail for longer than silhouettes, so the decision takes 0.8 s.
     """
     grey = [np.full(film[2].shape, 90, np.uint8)] * 20
     inputs = keypoint_inputs(film, human32, keypoints_of, lambda i: not 5 <= i < 14)
@@ -266,7 +266,7 @@ def test_a_predictor_sees_nobody_and_then_somebody(film, tracked, human32):
 
 
 def test_somebody_at_the_border_is_waited_for(film, tracked):
-    """Until the silhouette is whole, or for 0.5 s."""
+    """The track starts when the silhouette is complete, or after 0.5 s."""
     images = [np.roll(image, -150, axis=1) for image in film[1]]
     cut = []
     for image in images:

@@ -1,4 +1,4 @@
-"""Likelihoods carry the chain of the modes: weights, identities and where each comes from."""
+"""Likelihoods contain the chain of the modes: weights, identities and ancestry."""
 
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ SETTINGS = TrackerSettings(
 
 
 class Seen(NamedTuple):
-    """What is known after an image."""
+    """State after an image."""
 
     stamp: int
     modes: Modes
@@ -36,7 +36,7 @@ class Seen(NamedTuple):
 
 @pytest.fixture(scope='module')
 def images(human32, camera, motion, keypoints_of):
-    """Legs are cut off, a mask is empty, keypoints jump until the track is lost, then it ends."""
+    """Images with cut-off legs, an empty mask, jumps until the track is lost, then its end."""
     tracker = Tracker(human32, camera, SETTINGS)
     tracker.reset(GaussianMixture(np.ones(1), motion[:1], 0.01 * np.eye(32)[None]))
     black = np.zeros((camera.height, camera.width, 3), np.uint8)
@@ -55,7 +55,7 @@ def images(human32, camera, motion, keypoints_of):
         e = tracker.estimate
         lost, postures = e.status is Status.LOST, len(e.published)
         result.append(Seen(stamp, e.modes, postures, e.likelihood, e.foreseen, lost))
-    # All that is tested has happened.
+    # All tested events have occurred.
     assert [i for i, one in enumerate(result) if one.foreseen] == [3]
     assert [len(result[i].modes) > 1 for i in (5, 15, 17, 21)] == [True, True, False, True]
     assert all(result[i].postures > len(result[i].modes) for i in CUT)
@@ -65,7 +65,7 @@ def images(human32, camera, motion, keypoints_of):
 
 @pytest.fixture(scope='module')
 def begins(images):
-    """Images at which modes begin: in a new track, and where a lost one is found."""
+    """Images with first modes: those of a new track, and after a lost one is found."""
     result = [i for i, x in enumerate(images) if len(x.modes) and not x.modes.origins.shape[1]]
     assert [len(images[i - 1].modes) > 0 for i in result[1:]] == [True, False]
     assert images[result[1] - 1].lost
@@ -106,7 +106,7 @@ def test_components_continue_those_of_the_image_before(images, begins):
 
 
 def test_backward_weights_are_those_of_the_chain_of_the_modes(images, begins):
-    """By identities, whatever the order of the components, within each stretch of the track."""
+    """Compared by identities, for any order of components, within each part of the track."""
     differ = 0.0
     for first, end in zip(begins, [*begins[1:], len(images)], strict=True):
         stretch = [one for one in images[first:end] if len(one.modes)]

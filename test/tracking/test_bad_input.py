@@ -1,4 +1,4 @@
-"""The tracker under bad input: odd stamps, bad images, wrong keypoints, masks and predictions."""
+"""The tracker with bad input: odd timestamps, bad images, keypoints, masks and predictions."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ SETTINGS = TrackerSettings(
     candidates=8, max_hypotheses=4, searched_chains=1, estimate_shape=False, combinations=32
 )
 RATE = 10  # Hz
-# The first image of what is bad, and those after it in which the tracker may recover.
+# First bad image, and number of good images after the bad ones for recovery.
 BAD, SECOND = 8, RATE
-# Images at the end of that second in which errors are compared, and what they may be more, m.
+# Number of compared images at the end of recovery, and accepted increase of errors, m.
 JUDGED, MORE = 5, 0.04
 NOBODY_SEEN = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
-# What wears a shirt or shorts; the rest of the body is skin, hair and shoes.
+# Segments with a shirt or shorts; others are skin, hair and shoes.
 CLOTHED = ('pelvis', 'trunk', 'upper_arm', 'thigh')
 
 
 class Errors(NamedTuple):
-    """Errors in each image (T,), m: of the joints, mean, and of the place of the pelvis."""
+    """Mean joint errors and position errors of the pelvis in each image (T,), m."""
 
     heaviest: np.ndarray
     best: np.ndarray
@@ -40,7 +40,7 @@ class Errors(NamedTuple):
 
 @pytest.fixture(scope='module')
 def film(human32, camera):
-    """Poses and frames of 4.4 s of a person who dances, and the empty scene."""
+    """Poses and images of 4.4 s of a dancing person, and the empty scene."""
     view = Viewpoint(distance=3.2)
     poses = procedural_motion('dance', human32, 4.4, float(RATE), 3, viewpoint=view)
     scene = Scene(viewpoint=view, seed=2)
@@ -51,9 +51,9 @@ def film(human32, camera):
 
 @pytest.fixture(scope='module')
 def run(film, human32, camera, keypoints_of):
-    """Function (count, change, stamps, which, seed) -> errors of modes; `shown`: beliefs in cues.
+    """Function (count, change, stamps, which, seed) -> errors of modes; `shown`: reliabilities.
 
-    It follows so many images with their keypoints; change (i, inputs) may change what is given.
+    It tracks `count` images with their keypoints; change (i, inputs) can change the inputs.
     """
     poses, frames, empty = film
 
@@ -82,7 +82,7 @@ def run(film, human32, camera, keypoints_of):
 
 @pytest.fixture(scope='module')
 def usual(run, film):
-    """Errors where nothing is bad."""
+    """Errors with good input."""
     return run(len(film[0]))
 
 
@@ -98,7 +98,7 @@ def check(tracker, pair):
 
 
 def errors_of(body, mixture, true_body, pose):
-    """Errors of the joints of the heaviest and of the best mode, and of the place, m."""
+    """Joint errors of the heaviest and of the best mode, and position errors, m."""
     joints, truth = body.joint_positions(mixture.means), true_body.joint_positions(pose[None])
     gaps = (joints - joints[:, :1]) - (truth - truth[:, :1])
     found = np.linalg.norm(gaps, axis=2).mean(1)
@@ -106,7 +106,7 @@ def errors_of(body, mixture, true_body, pose):
 
 
 def exchanged(keypoints):
-    """The same with left for right."""
+    """The keypoints with left and right swapped."""
     order = [keypoints.names.index(other_side(name)) for name in keypoints.names]
     pixels, covariances = keypoints.pixels[order], keypoints.covariances[order]
     return Keypoints(keypoints.names, pixels, covariances, keypoints.confidences[order])
@@ -114,7 +114,7 @@ def exchanged(keypoints):
 
 @pytest.fixture(scope='module')
 def alterations(film, human32, camera, keypoints_of):
-    """By name: the number of bad images, and a function (i, inputs) that makes one of an input."""
+    """By name: number of bad images, and a function (i, inputs) that makes input bad."""
     _, frames, empty = film
     masks, shape = [x.mask for x in frames], empty.shape
     behind = Scene(viewpoint=Viewpoint(distance=3.2), seed=2).depth(camera)
@@ -125,7 +125,7 @@ def alterations(film, human32, camera, keypoints_of):
     others = procedural_motion('reach', human32, 1.0, float(RATE), 5, viewpoint=view)
 
     def show(picture):
-        # The detector sees nothing in it, either, and does not say so.
+        # The detector sees nothing in it, either, and gives no answer.
         return lambda i, inputs: inputs.update(image=picture(i - BAD), keypoints=None)
 
     def wall(i, inputs):
@@ -182,7 +182,7 @@ def alterations(film, human32, camera, keypoints_of):
 
 @pytest.fixture(scope='module')
 def altered(run, alterations):
-    """Function (name, with keypoints) -> errors, of so many bad images and a good second."""
+    """Function (name, with keypoints) -> errors in the bad images and a good second."""
     known = {}
 
     def follow(name, keypoints=True):
@@ -213,7 +213,7 @@ WITHOUT_KEYPOINTS = (
     'flash', 'covered lens', 'noise', 'wall in the colours of the clothes', 'wrong prediction',
     'mask from left to right', 'mask without legs', 'shifted depth',
 )  # fmt: skip
-# By images alone the modes may hold other poses of the same outlines for longer than a good second.
+# With images alone, modes with the same outline may stay wrong for longer than a good second.
 MAY_ERR = pytest.mark.xfail(strict=False, reason='images alone may leave the wrong pose')
 
 
@@ -234,7 +234,7 @@ def test_a_second_after_bad_input_the_pose_is_found_again(altered, usual, name):
 
 @pytest.mark.parametrize('name', CASES)
 def test_then_it_is_among_the_modes(altered, usual, name):
-    """Whichever of them is the heaviest."""
+    """Any of the modes may be the right one."""
     errors = altered(name).best
     last = slice(len(errors) - JUDGED, len(errors))
     assert np.median(errors[last]) < np.median(usual.best[last]) + MORE
@@ -243,7 +243,7 @@ def test_then_it_is_among_the_modes(altered, usual, name):
 @pytest.mark.parametrize(
     'name',
     [
-        # The person is soon taken to be nearer or further away, and returns slowly.
+        # The estimated distance soon changes, and returns slowly.
         pytest.param(name, marks=MAY_ERR if name.startswith(('wall', 'mask from')) else ())
         for name in WITHOUT_KEYPOINTS
     ],
@@ -267,16 +267,16 @@ def test_a_wrong_cue_is_doubted(altered, name, cues):
     shown = altered.shown[name, True]
     believed = np.array([min(one[cue] for cue in cues) for one in shown])
     assert believed[BAD - 1] > 0.9
-    # Of a depth that a pose explains, if badly, the doubt grows slowly.
+    # If a pose partly explains the depth, its reliability decreases slowly.
     least = believed[BAD : len(errors) - SECOND].min()
     assert least < (0.8 if cues == ['depth'] else 0.55)
-    # Depths are given in bad images only.
+    # Only bad images have depths.
     assert cues == ['depth'] or believed[-JUDGED:].min() > 0.7
 
 
 @pytest.mark.parametrize('gap', [0.1, 1000.0])
 def test_gaps(run, usual, gap):
-    """Of three seeds: a track may take a limb the wrong way."""
+    """Over three seeds, because a track may get a limb wrong."""
     count = BAD + SECOND
     stamps = [i / RATE + (gap if i >= BAD else 0.0) for i in range(count)]
     errors = [run(count, stamps=stamps, seed=seed).heaviest for seed in range(3)]
@@ -288,9 +288,9 @@ def test_gaps(run, usual, gap):
 
 @pytest.fixture(scope='module')
 def slowed(run, film):
-    """Numbers of images, the rate of which falls to a third in the middle, and their errors.
+    """Image indices, with a third of the rate from the middle on, and errors.
 
-    Of five seeds: a track may lose a limb that moves so far between images.
+    Over five seeds, because a track may lose a limb that moves far between images.
     """
     which = [*range(BAD), *range(BAD, len(film[0]), 3)]
     stamps = [i / RATE for i in which]
@@ -306,7 +306,7 @@ def test_a_rate_that_falls_in_the_middle(slowed, usual):
 
 
 def test_at_the_lower_rate_the_pose_stays_known(slowed, usual):
-    """A person who dances moves far in 0.3 s."""
+    """A dancing person moves far in 0.3 s."""
     which, errors = slowed
     late = np.median([one[-JUDGED:].mean() for one in errors])
     assert late < usual.heaviest[which[-JUDGED:]].mean() + 1.5 * MORE

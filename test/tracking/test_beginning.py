@@ -1,4 +1,4 @@
-"""What a track begins from without a subject: keypoints, masks and boxes."""
+"""Starts of tracks without a subject: keypoints, masks and boxes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FAST = TrackerSettings(
     likelihood=LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints),
     flow_weight=0.0,
 )  # fmt: skip
-# What COCO's detectors see.
+# Joints of COCO detectors.
 NAMES = tuple(
     f'{side}_{x}'
     for x in ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle')
@@ -49,7 +49,7 @@ def walk(human37):
 
 
 def detected(keypoints_of, body, pose, seed=0, names=NAMES, exchanged=False, sigma=2.0):
-    """Keypoints of some joints with the noise of a detector."""
+    """Keypoints of some joints with detector noise."""
     every = keypoints_of(body, pose, sigma, seed)
     called = list(names)
     rows = [every.names.index(name) for name in names]
@@ -76,7 +76,7 @@ def start(human37, camera, black, keypoints_of, walk):
 
 
 def error(body, pose, true_body, true_pose):
-    """Mean distance of joints, from the pelvis, in the size of the true person, m."""
+    """Mean joint error relative to the pelvis, scaled to the true person, m."""
     joints = body.joint_positions(pose[None])[0] * true_body.scale / body.scale
     truth = true_body.joint_positions(true_pose[None])[0]
     rows = [body.joint_names.index(x) for x in NAMES]
@@ -102,7 +102,7 @@ def test_keypoints_start_a_track_once_they_last(human37, camera, black, keypoint
 
 @pytest.mark.parametrize('stature', [1.55, 1.85])
 def test_depth_is_as_uncertain_as_the_stature(start, human37, walk, stature):
-    """One view tells no size; the covariance of the first mixture says so."""
+    """One view does not determine the size; the covariance of the first mixture shows it."""
     person = human37.with_stature(stature)
     tracker = start(person, 2)
     mixture = tracker.estimate.posterior
@@ -110,14 +110,14 @@ def test_depth_is_as_uncertain_as_the_stature(start, human37, walk, stature):
     wrong = mixture.means[0, 2] - walk[1, 2]
     assert 0.04 * walk[1, 2] < sigma < 0.12 * walk[1, 2]
     assert abs(wrong) < 2.5 * sigma
-    # In proportion to the size the depth is right.
+    # Relative to the size, the depth is correct.
     assert mixture.means[0, 2] / tracker.estimate.body.stature == pytest.approx(
         walk[1, 2] / stature, rel=0.06
     )
 
 
 def test_a_detector_that_begins_with_sides_exchanged(human37, camera, black, keypoints_of, walk):
-    """Exchanged in the first images: the person is the right way round within a second."""
+    """After exchanged first images the person has the right facing within a second."""
     tracker = Tracker(human37, camera, FAST)
     back = []
     for i in range(12):
@@ -136,7 +136,7 @@ def test_the_same_keypoints_give_the_same_track(start):
 
 
 def near(tracker, truth):
-    """Whether the place of the heaviest mode is that of a pose, in a fifth of the distance."""
+    """Whether the heaviest mode's position agrees with a pose to a fifth of the distance."""
     return np.abs(tracker.estimate.posterior.means[0, :3] - truth[:3]).max() < 0.2 * truth[2]
 
 
@@ -161,7 +161,7 @@ def test_a_box_starts_a_track(human37, camera, black, walk):
     assert tracker.estimate.started_from is Source.BOX
     assert near(tracker, walk[0])
     assert np.sqrt(posterior.covariances[0, 2, 2]) > 0.05 * walk[0, 2]
-    # It is known for one image only.
+    # It is available for one image only.
     tracker.reset()
     assert tracker.step(black, FRAME) == (None, None)
 
@@ -190,7 +190,7 @@ def test_keypoints_of_a_detector_start_a_track(human37, name):
 
 
 def test_why_no_track_starts_is_said(camera, human37, filmed):
-    """Somebody is in view from the first image on, and nothing says who."""
+    """A person is in view from the first image, without any start information."""
     _, images, _ = filmed('walk', 1.2, camera)
     tracker = Tracker(human37, camera, FAST)
     for i in range(60):
@@ -202,7 +202,7 @@ def test_why_no_track_starts_is_said(camera, human37, filmed):
 
 
 def test_a_track_that_a_ghost_began_ends(camera, human37, filmed):
-    """Somebody keeps still while the scene is learned, then walks: a prediction begins a track."""
+    """A person stands still while the scene is learned, then walks; a prediction starts a track."""
     _, images, _ = filmed('walk', 1.2, camera)
     tracker = Tracker(human37, camera, TrackerSettings(candidates=8, max_hypotheses=4))
     for i in range(21):

@@ -1,4 +1,4 @@
-"""A camera that moves: what is carried from image to image, and tracks that do not notice it."""
+"""A moving camera: transformed states, and tracks that do not depend on the motion."""
 
 from dataclasses import dataclass, replace
 
@@ -35,12 +35,12 @@ def body():
 
 @pytest.fixture(scope='module')
 def walking(body):
-    """Poses (20, d) before a still camera, 10 Hz."""
+    """Poses (20, d) in the frame of a fixed camera, 10 Hz."""
     return procedural_motion('walk', body, 2.0, 10.0, 1)
 
 
 def drive(t, pitch=0.0):
-    """A camera that passes sideways at 0.8 m/s, turning by 20 degrees a second."""
+    """Pose of a camera that moves sideways at 0.8 m/s and turns by 20 degrees per second."""
     turn = Rotation.from_euler('yx', [-20.0 * t, pitch], degrees=True).as_matrix()
     return CameraPose.of([0.8 * t, -0.1 * t, 0.05 * np.sin(t)], turn)
 
@@ -69,7 +69,7 @@ def modes_of(body, poses, seed=0):
     )
 
 
-# What is carried.
+# Transformed states.
 
 
 @pytest.mark.parametrize('pitch', [0.0, 25.0])
@@ -77,7 +77,7 @@ def test_joints_of_carried_poses_stand_where_they_stood(body, walking, pitch):
     motion = motion_of(0.7, pitch)
     before, after = body.joint_positions(walking), motion.poses(body, walking)
     np.testing.assert_allclose(body.joint_positions(after), motion.points(before), atol=1e-9)
-    # Nobody turns about by a whole turn.
+    # Angles do not jump by a whole turn.
     assert np.abs(after - walking)[:, 3].max() < 1.0
 
 
@@ -92,7 +92,7 @@ def test_jacobians_are_the_derivatives(body, walking, pitch):
 
 
 def test_carrying_and_predicting_commute(body, walking):
-    """Before a level camera that turns about the vertical the dynamics are those of the world."""
+    """For a level camera that turns about the vertical, the dynamics are those of the world."""
     modes, motion = modes_of(body, walking[:3]), motion_of(0.3)
     dynamics = dynamics_of(body, 'learned')
 
@@ -110,12 +110,12 @@ def test_carrying_and_predicting_commute(body, walking):
     other = motion.modes(body, predicted(modes))
     for name in ('poses', 'velocities', 'state_covariances'):
         np.testing.assert_allclose(getattr(first, name), getattr(other, name), atol=1e-7)
-    # The same without being carried is another prediction.
+    # Without the transformation the prediction differs.
     assert np.abs(first.poses - predicted(modes).poses).max() > 0.1
 
 
 def test_feet_rest_before_a_moving_camera(body):
-    """Who stands, stands; without the motion of the camera the same feet would slide."""
+    """A standing person stands; without the camera's motion the feet would slide."""
     standing = np.repeat(
         procedural_motion('reach', body, 0.1, 10.0, 1)[:1], 15, axis=0
     )  # fmt: skip
@@ -142,7 +142,7 @@ def test_feet_rest_before_a_moving_camera(body):
 
 
 def test_ways_to_face_are_carried(body):
-    """Who turns the back to the camera is seen again; the evidence so far is unchanged."""
+    """Front or back view is determined again; the evidence so far is unchanged."""
     poses = np.tile(body.prior_mean, (3, 1))
     poses[:, 2] = 4.0
     heading = body.dof_names.index('root_z')
@@ -152,7 +152,7 @@ def test_ways_to_face_are_carried(body):
     modes = replace(modes_of(body, poses), back=ways(body, joints, joints[0]), facing=odds)
     assert modes.back.tolist() == [False, True, False]
     for degrees, back in ((90.0, [False, True, True]), (20.0, [False, True, False])):
-        # Around the person: from the side one of two who faced the camera turns the back.
+        # Around the person: one of two modes in front view changes to the back view.
         around = Rotation.from_euler('y', degrees, degrees=True).as_matrix()
         place = np.array([0.0, 0.0, 4.0])
         still = CameraPose.of(np.zeros(3), np.eye(3))
@@ -160,7 +160,7 @@ def test_ways_to_face_are_carried(body):
         carried = motion.modes(body, modes)
         assert carried.back.tolist() == back
         assert np.array_equal(carried.facing, odds)
-        # An image that tells nothing leaves either way of two the weight that it had.
+        # An image without information does not change the weights of the two facings.
         found = []
         for some in (modes[:2], carried[:2]):
             nothing = np.zeros(2)
@@ -193,13 +193,13 @@ def test_a_path_interpolates_and_goes_on():
     assert not path.known
     assert path.advance(FRAME, poses[1]) is None
     check(path.advance(2 * FRAME, poses[2]), poses[1], poses[2], 1e-12)
-    # Two images without a pose: as before, up to what accelerates.
+    # Two images without a pose: extrapolated, up to the acceleration.
     for i in (3, 4):
         check(path.advance(i * FRAME, None), poses[i - 1], poses[i], 2e-3)
         assert path.known
-    # What was guessed is not held against the pose that is given then.
+    # An extrapolation does not affect the next given pose.
     check(path.advance(5 * FRAME, poses[5]), poses[4], poses[5], 2e-3)
-    # A pose between two images counts for none.
+    # A pose between two images is not used.
     check(path.advance(6 * FRAME, poses[6]), poses[5], poses[6], 1e-12)
     for i in range(7, 11):
         path.advance(i * FRAME, None)
@@ -247,9 +247,9 @@ class Places:
 
 @pytest.fixture(scope='module')
 def track(body, camera, walking):
-    """Function (pose of the camera by time) -> a tracker of places, and what it finds.
+    """Function (pose of the camera by time) -> a tracker of joint positions, and its results.
 
-    The measurements are those of the fixed frame, so that the camera makes no difference to them.
+    The measurements are taken in the fixed frame, so that they do not depend on the camera.
     """
 
     def run(path, *, told, background=None, frames=10):
@@ -309,7 +309,7 @@ def test_a_told_camera_that_stands_still_changes_no_bit(track, camera):
 
 
 def test_what_a_moving_camera_sees_is_what_a_still_one_sees(body, track):
-    """Poses, velocities and covariances are those of the still camera, in another frame."""
+    """Poses, velocities and covariances are those of the fixed camera, in another frame."""
     _, moving = track(drive, told=True)
     _, resting = track(still, told=False)
     _, untold = track(drive, told=False)
@@ -327,7 +327,7 @@ def test_what_a_moving_camera_sees_is_what_a_still_one_sees(body, track):
         gaps.append(np.linalg.norm(pelvis[0] - motion.points(pelvis[1])))
         slips.append(np.linalg.norm(untold[t][2].velocities[0, :3] - wanted.velocities[0, :3]))
     assert max(gaps) < 2e-3
-    # A camera that is not told of takes its own motion for the person's.
+    # Without the camera's pose its motion is taken for the person's.
     assert np.mean(slips[4:]) > 0.5
 
 

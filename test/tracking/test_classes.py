@@ -1,4 +1,4 @@
-"""The way to face: a chain of two states against its equations."""
+"""Facing: a chain of two states, compared with its equations."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def both(human32):
 
 @pytest.fixture(scope='module')
 def turned(human32):
-    """Function (pose, angle) -> the pose (1, d) turned about the vertical of the image."""
+    """Function (pose, angle) -> the pose (1, d) rotated about the vertical of the image."""
 
     def turn(pose, angle):
         c, s = np.cos(angle), np.sin(angle)
@@ -52,7 +52,7 @@ def turned(human32):
 
 @pytest.fixture(scope='module')
 def weigh(human32, both):
-    """Function (modes, evidence of the two poses, followed) -> log weights, modes a step on."""
+    """Function (modes, evidence of the two poses, followed) -> log weights, next modes."""
 
     def step(modes, evidence, followed=KNOWN, before=None, poses=both, dt=DT):
         before = np.zeros(len(poses)) if before is None else before
@@ -74,7 +74,7 @@ def weighed(body, modes, predicted, poses, transitions, before, evidence, follow
 
 
 def begun(body, poses, facing=None, log_odds=-MAX_FACING_NATS):
-    """Modes, the first of which leads; log odds that the person faces the other way."""
+    """Modes with the first leading, and log odds that the person faces the other way."""
     joints = body.joint_positions(poses)
     back = ways(body, joints, joints[0])
     if facing is None:
@@ -83,12 +83,12 @@ def begun(body, poses, facing=None, log_odds=-MAX_FACING_NATS):
 
 
 def log_odds_of(modes):
-    """That the person faces the other way than the first mode."""
+    """Log odds that the person does not face as in the first mode."""
     return -modes.facing[0]
 
 
 def led_by(body, modes, first):
-    """The modes with another one first."""
+    """The modes with another leading mode."""
     order = np.argsort(np.arange(len(modes)) != first, kind='stable')
     return begun(body, modes.poses[order], modes.facing[order])
 
@@ -102,9 +102,9 @@ def test_evidence_that_lasts_turns_the_track_about(human32, both, weigh):
         if log_weights[1] > log_weights[0]:
             break
         assert images < 20
-    # Half a nat an image, of which four fifths are believed, and what the chain forgets meanwhile.
+    # Half a nat per image, discounted to four fifths, minus the chain's forgetting.
     assert 6 < images <= 10
-    # The other way leads from now on, and the odds are those of the way that was left.
+    # The other facing leads now, and the odds are those of the previous one.
     modes = led_by(human32, modes, 1)
     assert -1.0 < log_odds_of(modes) < 0.0
     assert list(modes.back) == [False, True]
@@ -125,7 +125,7 @@ def test_hypotheses_that_were_not_followed_are_no_evidence(human32, both, weigh)
 
 
 def test_one_image_says_only_as_much_as_it_may_be_believed():
-    """Either it speaks of the person, with the probability v, or it says the opposite by chance."""
+    """With probability v its evidence is about the person, otherwise it is random."""
     for evidence in (-5.0, -0.3, 0.0, 0.3, 2.0):
         ratio = np.exp(evidence)
         wanted = np.log(
@@ -139,7 +139,7 @@ def test_one_image_says_only_as_much_as_it_may_be_believed():
 
 
 def test_seen_from_the_side_either_way_may_go_on(human32, both):
-    """Where a way is near the other one, what was known of the ways is gone."""
+    """When both facings are close to each other, the earlier evidence is lost."""
     modes, near = begun(human32, both[:1], log_odds=-8.0), np.array([[0.0, -0.01]])
     nothing = np.zeros(2)
     log_weights, modes = weighed(human32, modes, both[1:], both, near, nothing, nothing, KNOWN, DT)
@@ -148,7 +148,7 @@ def test_seen_from_the_side_either_way_may_go_on(human32, both):
 
 
 def test_a_person_who_turns_away_leads_the_track_along(human32, both, turned):
-    """Past the side, the hypothesis that goes on turning weighs as if nothing was known."""
+    """Past the side view, the turning hypothesis is weighted as without earlier evidence."""
     step = np.radians(16.0)
     side = next(
         a
@@ -169,7 +169,7 @@ def test_a_person_who_turns_away_leads_the_track_along(human32, both, turned):
         human32, first, before, poses, transitions, np.zeros(2), [3.0, 0.0], KNOWN, 1.0
     )
     assert log_weights[1] > log_weights[0] + 1.0
-    # Also if nothing else is left.
+    # Also if it is the only one left.
     _, modes = weighed(
         human32, first, before, poses[1:], transitions[:, 1:], np.zeros(1), [0.0], KNOWN[:1], 1.0
     )

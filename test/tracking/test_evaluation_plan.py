@@ -1,4 +1,4 @@
-"""What the evaluations of an image are spent on."""
+"""How the evaluations of an image are allocated."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def test_a_motion_surprises_by_what_the_image_tells_of_it(seconds):
     usual = moves[0] * np.sqrt(SURPRISING_RATIO * mean / (moves[0] @ precision @ moves[0]))
     assert not is_surprising(0.9 * usual, precision, hessian)
     assert is_surprising(1.1 * usual, precision, hessian)
-    # An image that tells nothing moves nothing.
+    # An uninformative image moves nothing.
     assert not is_surprising(np.zeros(d), precision, precision)
 
 
 @pytest.fixture(scope='module')
 def film(filmed, camera):
-    """Poses, images and the empty scene of a person who walks."""
+    """Poses, images and the empty scene of a walking person."""
     return filmed('walk', 0.8, camera)
 
 
@@ -62,7 +62,7 @@ def test_an_image_keeps_to_its_budget(film, human32, camera, keypoints_of, budge
         assert posterior is not None
         spent.append(tracker.estimate.evaluations)
         if i > 0:
-            # Postures of a limb that no image shows have the root of their mode.
+            # Postures of an unseen limb share the root of their mode.
             modes = np.unique(posterior.means[:, :6], axis=0)
             assert len(modes) <= settings.plan.hypotheses
     assert max(spent[1:]) < 1.5 * budget + 10

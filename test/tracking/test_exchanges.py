@@ -1,4 +1,4 @@
-"""Exchanged sides from image to image."""
+"""Exchanged sides of keypoints from image to image."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def standing():
 
 
 def after(observation, count, dt=1.0 / 30.0, exchanges=None):
-    """Log probabilities of exchanges (1, E) after so many images of one pose."""
+    """Log probabilities of exchanges (1, E) after `count` images of one pose."""
     if exchanges is None:
         exchanges = np.full((1, usual_exchanges().shape[1]), np.nan)
     likelihood = ImageLikelihood(BODY, CAMERA)
@@ -57,7 +57,7 @@ def test_an_exchange_is_expected_to_stay_and_is_forgotten():
 def test_what_is_known_of_the_detector_counts_whole_beside_energies_that_last():
     pose = standing()[None]
     posterior = Posterior(BODY, CAMERA, TrackerSettings(likelihood=LIKELIHOOD))
-    # Positions would say that nothing is exchanged.
+    # Positions would show that nothing is exchanged.
     turned = Observation(keypoints=exchanged(seen(standing(), lifted=False), LIMBS))
     sure = np.log(np.array([[1e-3, 1.0 - 3e-3, 1e-3, 1e-3]]))
     unsure = np.log(np.array([[1.0 - 3e-3, 1e-3, 1e-3, 1e-3]]))
@@ -65,7 +65,7 @@ def test_what_is_known_of_the_detector_counts_whole_beside_energies_that_last():
     costs = posterior.evidence(pose, turned, unsure, dt) - posterior.evidence(
         pose, turned, sure, dt
     )
-    # However little an image counts, an exchange that is not expected costs its improbability.
+    # However little an image counts, an unexpected exchange costs its improbability.
     assert costs[0] > 0.7 * np.log(1e3)
 
 
@@ -73,13 +73,13 @@ def test_what_is_known_of_the_detector_counts_whole_beside_energies_that_last():
 
 FRAME = 33_333_333
 IMAGES = 40
-# Runs of images in which a detector exchanges the sides of all, of the arms, of the legs: 30 %.
+# Images in which a detector exchanges the sides of all limbs, the arms or the legs: 30 %.
 RUNS = {4: ALL, 5: ALL, 6: ALL, 12: ARMS, 13: ARMS, 20: ALL, 21: ALL, 22: ALL, 23: ALL, 30: LEGS,
         31: LEGS, 32: LEGS}  # fmt: skip
 
 
 def tracked(motion, *, exchanged_sides):
-    """Mean error of the heaviest mode, m, and whether it ever faces the wrong way."""
+    """Mean error of the heaviest mode, m, and in how many images it faces the wrong way."""
     rng = np.random.default_rng(0)
     settings = TrackerSettings(likelihood=LIKELIHOOD)
     tracker = Tracker(BODY, CAMERA, settings)
@@ -105,6 +105,6 @@ def test_a_track_survives_a_detector_that_exchanges_sides_in_runs():
     straight, never = tracked(motion, exchanged_sides=False)
     confused, wrong = tracked(motion, exchanged_sides=True)
     assert never == 0
-    # The odds of the two ways to face are even for a moment: the person is seen from the side.
+    # Both facings are equally likely for a moment: the person is seen from the side.
     assert wrong <= 3
     assert confused < straight + 0.03

@@ -1,4 +1,4 @@
-"""Existence as a probability: the cues one by one at known poses, and an oracle."""
+"""Existence probability: single cues at known poses, and an oracle."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NO_KEYPOINTS = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 
 
 def test_without_an_image_nobody_is_not_said():
-    """However long it lasts: r stays far above the limit."""
+    """For any duration, r stays far above the limit."""
     for dt in (1.0, 1e3, 1e9):
         assert CHAIN.predict([1 - GIVEN, GIVEN], dt)[1] > 5 * ABSENT_PROBABILITY
 
@@ -59,7 +59,7 @@ def test_against_the_bernoulli_filter_of_stone_soup():
         ours = CHAIN.predict(ours, dt)
         theirs = predictor.estimate_existence(theirs)
         time = datetime(2020, 1, 1, tzinfo=timezone.utc) + timedelta(seconds=step * dt)
-        # The particles lie where the person is.
+        # The particles are at the person's position.
         state = BernoulliParticleStatePrediction(
             StateVectors(np.zeros((1, 4))), log_weight=np.full(4, math.log(0.25)),
             existence_probability=theirs, timestamp=time,
@@ -85,7 +85,7 @@ def film(filmed, camera, human32):
 
 @pytest.fixture(scope='module')
 def watched(film, human32, camera):
-    """Function (views, rate) -> probabilities, what was seen, the existence that has watched."""
+    """Function (views, rate) -> probabilities, detections, and the updated existence."""
 
     def watch(views, rate=10.0, pose_of=lambda pose, _: pose, watching=None, first=0):
         if watching is None:
@@ -128,15 +128,15 @@ def test_an_empty_scene_ends_it_within_half_a_second(film, watched, rate):
     found, seen, watching = watched(empty_views(film, 20), rate, watching=watching, first=6)
     assert not any(seen)
     assert watching.nobody
-    # After the last image of the person, which is one before the first.
+    # After the last image of the person, which precedes the first of these.
     assert 0.3 <= (1 + np.argmax(found < ABSENT_PROBABILITY)) / rate <= 0.5
-    # Who comes is there within 0.3 s.
+    # A new person is detected within 0.3 s.
     found, seen, _ = watched(full_views(film, 10), rate, watching=watching, first=26)
     assert 0.1 <= np.argmax(found > PRESENT_PROBABILITY) / rate <= 0.34
 
 
 def test_a_wrong_pose_is_not_an_absent_person(film, watched):
-    """The silhouette is as large as usual, beside the model: the track has to search."""
+    """The silhouette has the usual size, but beside the model: the track must search."""
 
     def aside(pose, i):
         return pose if i < 6 else pose + 0.9 * (np.arange(len(pose)) == 0)
@@ -177,14 +177,14 @@ def test_images_that_show_nothing_say_nothing(film, watched, kind, background):
 
 
 def test_colours_are_asked_where_the_background_is_of_no_use(film, watched):
-    """The camera was pushed: everything is foreground, the person is still there."""
+    """The camera was pushed: everything is foreground, the person is still present."""
     _, images, _, empty = film
     everything = np.ones(empty.shape[:2], dtype=np.bool_)
     _, _, watching = watched(full_views(film))
     pushed = [view_of(images[i], everything, changed=1.0) for i in (6, 7)]
     _, seen, _ = watched(pushed, watching=watching, first=6)
     assert seen == [True] * 2
-    # There they say nothing against the person.
+    # Then colours are no evidence against the person.
     watched([view_of(empty, everything, changed=1.0)] * 3, watching=watching, first=8)
     assert watching.last.llr == 0.0
 
@@ -202,7 +202,7 @@ def test_colours_decide_where_there_is_no_background(film, watched):
 
 @pytest.mark.parametrize('rate', [10.0, 5.0, 2.7])
 def test_a_thing_that_was_taken_for_somebody_leaves_the_image(film, watched, rate):
-    """A track is on a thing and the camera turns: the person is in view as before."""
+    """A track is on an object and the camera turns; the person is in view as before."""
     _, images, _, _ = film
 
     def aside(pose, _=0):
@@ -219,7 +219,7 @@ def test_a_thing_that_was_taken_for_somebody_leaves_the_image(film, watched, rat
     assert all(seen)
     turned = [View(np.roll(image, 60, axis=1)) for image in images]
     found, seen, _ = watched(turned * 3, rate, watching=watching, first=2 * len(before))
-    assert not any(seen)  # it is not what was learned
+    assert not any(seen)  # the appearance differs from the learned one
     assert not watching.somebody
     assert found.min() > 5 * ABSENT_PROBABILITY
 
@@ -249,7 +249,7 @@ def test_keypoints_far_from_the_model_are_somebody_elsewhere(film, watched):
     _, _, watching = watched([View(grey)] * 2)
     watched([View(grey, keypoints=keypoints(12, 0.9, (160.0, 120.0)))], watching=watching, first=2)
     assert not watching.last.elsewhere
-    # In 0.1 s nobody walks 1.2 m.
+    # Nobody walks 1.2 m in 0.1 s.
     far = [View(grey, keypoints=keypoints(12, 0.9, (10.0, 120.0)))]
     watched(far, watching=watching, first=3)
     assert not watching.last.elsewhere
@@ -259,7 +259,7 @@ def test_keypoints_far_from_the_model_are_somebody_elsewhere(film, watched):
 
 @pytest.mark.parametrize('hidden', [0.6, 1.0])
 def test_who_is_hidden_has_not_left(film, watched, hidden):
-    """Somebody else stands before the person; no cue counts, for as long as that lasts."""
+    """Another person is in front; no cue is used during the occlusion."""
     others = np.zeros(film[3].shape[:2], dtype=np.bool_)
     _, _, watching = watched(full_views(film))
     rows = np.flatnonzero(film[2][5].any(1))
@@ -273,12 +273,12 @@ def test_who_is_hidden_has_not_left(film, watched, hidden):
     assert found[-1] > 0.3
 
 
-# What stands still.
+# Static objects.
 
 
 @pytest.mark.parametrize('waiting', [False, True])
 def test_a_detector_says_the_same_of_the_same_picture(waiting, human37, camera, keypoints_of):
-    """Before a track, keypoints on a thing that never changes count once; a person moves."""
+    """Before a track, keypoints on a static object count only once, because people move."""
     rng = np.random.default_rng(0)
     thing = rng.integers(0, 255, (camera.height, camera.width, 3), dtype=np.uint8)
     pose = human37.prior_mean.copy()
@@ -309,7 +309,7 @@ def bare_views(film, indices):
 
 
 def test_a_person_who_moves_is_there(film, watched):
-    """Though nothing else tells: by the rates alone it would be two thirds after two seconds."""
+    """Motion is the only evidence; without it the probability would be 2/3 after two seconds."""
     found, seen, watching = watched(bare_views(film, range(10)), 5.0)
     assert all(seen)
     assert found.min() > 0.95

@@ -1,4 +1,4 @@
-"""Both ways to face are modes of one mixture until the images have decided."""
+"""Both facings are modes of one mixture until the images have decided."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ SMALL = TrackerSettings(
 
 @pytest.fixture(scope='module')
 def film(filmed, camera):
-    """Poses, images and the empty scene of a person who stands before the camera and reaches."""
+    """Poses, images and empty scene of a person who faces the camera and reaches for things."""
     return filmed('reach', 2.0, camera)
 
 
 @pytest.fixture(scope='module')
 def followed(film, human32, camera, keypoints_of):
-    """Function (with keypoints, sure) -> tracker and posteriors of a track that is told wrongly.
+    """Function (with keypoints, sure) -> tracker and posteriors of a track that starts wrongly.
 
     The prediction of the first image faces the other way than the person; if the start is sure,
     it is all that the track starts from, else its reversal is among its modes. Each is made once.
@@ -60,7 +60,7 @@ def test_directions_to_the_left(human32, motion):
     pose[0, 2] = 3.0
     left = left_directions(human32, np.concatenate([pose, motion]))
     assert np.linalg.norm(left, axis=1) == pytest.approx(np.ones(len(left)))
-    # Who faces the camera has the left hand at the right side of the image.
+    # The left hand of a person who faces the camera is on the right of the image.
     turned = reverse_depth(human32, pose)
     assert left_directions(human32, turned)[0, 0] == pytest.approx(-left[0, 0], abs=1e-9)
 
@@ -74,7 +74,7 @@ def test_the_reversal_in_depth_faces_the_other_way(human32, motion):
 
 
 def ways(body, posteriors, poses):
-    """Of each posterior the weight of the modes that face as the person does."""
+    """For each posterior, the weight of the modes that face the same way as the person."""
     true = body.joint_positions(poses[: len(posteriors)])
     return [
         float(p.weights[~faces_back(body, body.joint_positions(p.means), joints)].sum())
@@ -85,7 +85,7 @@ def ways(body, posteriors, poses):
 def check(posteriors):
     for posterior in posteriors:
         assert posterior.weights.sum() == pytest.approx(1.0)
-        # Feet that lie below the image are held in several ways.
+        # Feet below the image have several possible postures.
         assert len(posterior) <= 4 * SMALL.max_hypotheses
         assert (np.diff(posterior.weights) <= 0).all()
 
@@ -114,13 +114,13 @@ def test_keypoints_decide(film, followed, human32):
 
 
 def test_a_track_that_was_sure_of_the_wrong_way_turns_about(film, followed, human32):
-    """Not at once: detectors exchange sides, too."""
+    """Not at once, because detectors exchange sides, too."""
     _, posteriors = followed(keypoints=True, sure=True)
     right = ways(human32, posteriors, film[0])
     assert right[0] == 0.0
     assert max(right[:4]) < 0.1
     assert max(right[:5]) < 0.5
-    # A mode of the right way is kept for when it is needed.
+    # A mode that faces the right way is kept.
     assert sum(share > 0.0 for share in right[1:]) >= len(right) - 3
     assert min(right[-5:]) > 0.9
     check(posteriors)

@@ -1,4 +1,4 @@
-"""The ground: what is known of it, and what a track says of it."""
+"""The ground: prior knowledge, and its estimate from a track."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def body():
 
 @pytest.fixture(scope='module')
 def reaching(body) -> np.ndarray:
-    """(90, d) somebody who stands on both feet and reaches for things."""
+    """Poses (90, d) of a person who stands on both feet and reaches for things."""
     return procedural_motion('reach', body, 3.0, RATE, 1, viewpoint=PITCHED)
 
 
@@ -122,9 +122,9 @@ def test_a_floor_is_measured_where_its_height_was_given(body, reaching):
     sure = KnownGround(up, 1.4, np.radians(0.5))
     assert after(GroundEstimator(sure), body, reaching[:5]).plane.measured
     assert not after(GroundEstimator(KnownGround(up)), body, reaching[:5]).plane.measured
-    # Two degrees are 12 cm where the person is: the soles know better.
+    # Two degrees are 12 cm at the person; the soles are more precise.
     assert not after(GroundEstimator(KnownGround(up, 1.4)), body, reaching[:5]).plane.measured
-    # Where the vertical is not known the height of the camera says little of the floor at the feet.
+    # Without the vertical, the camera height hardly determines the floor at the feet.
     assert not after(GroundEstimator(KnownGround(None, 1.4)), body, reaching[:5]).plane.measured
 
 
@@ -139,7 +139,7 @@ def test_the_vertical_is_found_slowly_and_never_surely(body, reaching):
     assert errors[-1] < 10.0
     assert all(a > b - 0.5 for a, b in pairwise(errors))
     assert estimator.estimate.up_sigma >= AXIS_SIGMA * 0.99
-    # Where the person is, the floor is under the soles all the same.
+    # At the person, the floor is still under the soles.
     feet, plane = soles(body), estimator.plane
     points = forward(body.skeleton, reaching[-1:]).points(feet.segments, feet.local)[..., 0]
     assert (points @ plane.up + plane.height).min() == pytest.approx(
@@ -148,7 +148,7 @@ def test_the_vertical_is_found_slowly_and_never_surely(body, reaching):
 
 
 def looked(estimator: GroundEstimator, *pitches: float | None) -> GroundEstimator:
-    """The estimator after looks at rooms that are seen from these pitches, deg; None: grey."""
+    """The estimator after images of rooms at these camera pitches, deg; None is a grey image."""
     for second, pitch in enumerate(pitches):
         grey = np.full((ROOM_CAMERA.height, ROOM_CAMERA.width, 3), 120, np.uint8)
         image = grey if pitch is None else drawn(room(), turn(np.radians(pitch), 0.0))
@@ -194,7 +194,7 @@ def test_a_given_vertical_is_refined_by_lines_that_agree():
     alone = looked(GroundEstimator(), 15.0).estimate
     for sigma in (0.5, 2.0, 8.0):
         found = looked(GroundEstimator(pitched(13.5, sigma)), 15.0).estimate
-        # Two measurements of one angle: the mean by their precisions.
+        # Two measurements of one angle give their precision-weighted mean.
         precise = np.array([np.radians(sigma), alone.up_sigma]) ** -2.0
         between = precise[1] / precise.sum()
         angle = degrees_between(found.up, pitched(13.5).up)
@@ -212,13 +212,13 @@ def test_a_given_vertical_is_followed_where_the_lines_say_nothing_or_once(given,
 
 
 def test_a_given_vertical_that_is_wrong_is_contradicted_and_followed():
-    """An inertial sensor that is mounted turned by 30 degrees."""
+    """An inertial sensor is mounted with a rotation of 30 degrees."""
     estimator = GroundEstimator(pitched(30.0))
     looked(estimator, 0.0, 0.0)
     assert estimator.contradicted
     assert pitch_of(estimator) == pytest.approx(30.0)
     assert np.degrees(estimator.estimate.up_sigma) == pytest.approx(2.0)
-    estimator.forget_scene()  # another scene may agree with it
+    estimator.forget_scene()  # another scene can agree with it
     assert not estimator.contradicted
     looked(estimator, 0.0, 0.0)
     assert estimator.contradicted
@@ -256,7 +256,7 @@ def test_the_person_tells_a_camera_that_hangs_from_an_accelerometer(hangs):
     estimator.see(standing(names, down=not hangs))
     assert estimator.reversed != hangs
     assert estimator.estimate.up == pytest.approx([0.0, 1.0 if hangs else -1.0, 0.0])
-    # Half of a trunk says nothing, and gravity that points down in the image stays.
+    # Half a trunk is no evidence, and gravity that points down in the image is kept.
     half = GroundEstimator(KnownGround(np.array([0.0, 1.0, 0.0])))
     half.see(standing(names[1:], down=True))
     assert not half.reversed
@@ -268,7 +268,7 @@ def test_the_person_tells_a_camera_that_hangs_from_an_accelerometer(hangs):
 def test_a_person_who_lies_by_the_given_vertical_contradicts_an_unusual_one(body, reaching):
     ahead, tilted = np.array([0.0, 0.0, 1.0]), up_of(Viewpoint(pitch=np.radians(40.0)))
     assert after(GroundEstimator(KnownGround(ahead)), body, reaching[:40]).contradicted
-    # The true one, and somebody who lies before a camera that is about level: people do.
+    # The true vertical, and a person who lies in front of a level camera, are no contradiction.
     assert not after(GroundEstimator(KnownGround(up_of(PITCHED))), body, reaching).contradicted
     assert not after(GroundEstimator(KnownGround(tilted)), body, reaching).contradicted
     lying = reaching.copy()
@@ -279,11 +279,11 @@ def test_a_person_who_lies_by_the_given_vertical_contradicts_an_unusual_one(body
 
 @pytest.mark.parametrize('rate', [10.0, 30.0, 60.0])
 def test_contacts_are_those_of_a_walker(body, rate):
-    """Points of the soles that rest in the motion rest, and those that swing do not."""
+    """Sole points at rest in the motion are detected as resting, swinging ones are not."""
     poses = procedural_motion('walk', body, 3.0, rate, 1, viewpoint=PITCHED)
     plane = GroundEstimator(KnownGround(up_of(PITCHED), 1.4)).plane
     found = resting(body, plane, poses, rate)
-    # Each foot moves as its slowest point does.
+    # A foot is as fast as its slowest point.
     points = sole_points(body, poses).reshape(len(poses), 2, 2, 3)
     speed = rate * np.linalg.norm(np.diff(points, axis=0), axis=3).min(2)
     late = slice(round(0.15 * rate), None)
@@ -297,7 +297,7 @@ def test_contacts_are_those_of_a_walker(body, rate):
 
 @pytest.mark.parametrize('rate', [3.0, 10.0, 30.0, 120.0])
 def test_feet_rest_at_any_rate(body, rate):
-    """The poses of somebody who stands err from image to image as they do in tracks."""
+    """Poses of a standing person have errors as in tracks."""
     poses = procedural_motion('reach', body, 4.0, rate, 1, viewpoint=PITCHED)
     rng, kept = np.random.default_rng(0), np.exp(-1.0 / (rate * ERRORS['image'].time))
     error = 0.008 * rng.normal(size=3)
@@ -325,7 +325,7 @@ def test_before_a_camera_that_moves_only_heights_tell_of_contact(body, reaching)
 
 
 def test_the_lean_is_measured_against_gravity_and_not_against_the_camera(body, camera, reaching):
-    """Turned with the vertical, a pose costs what it did."""
+    """A pose rotated together with the vertical has the same energy."""
     settings = TrackerSettings(likelihood=LikelihoodSettings(self_intersection_sigma=np.inf))
     level = procedural_motion('reach', body, 0.1, RATE, 1, viewpoint=Viewpoint(3.5, 1.4))
     pitched = procedural_motion('reach', body, 0.1, RATE, 1, viewpoint=PITCHED)
@@ -346,7 +346,7 @@ def test_the_lean_is_measured_against_gravity_and_not_against_the_camera(body, c
 
 @pytest.mark.parametrize('ground', [GroundSettings(), OFF])
 def test_a_tracker_knows_its_ground(ground, human32, camera, motion, keypoints_of):
-    """A body that reaches for things before a level camera 1.2 m above the floor."""
+    """A body reaches for things in front of a level camera 1.2 m above the floor."""
     likelihood = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
     settings = TrackerSettings(
         candidates=8, max_hypotheses=4, likelihood=likelihood, estimate_shape=False, ground=ground,

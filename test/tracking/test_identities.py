@@ -1,4 +1,4 @@
-"""Identities of modes, which last from image to image."""
+"""Identities of modes, which persist from image to image."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ FRAME = 100_000_000  # ns
 
 
 def jumps(*rows: str) -> np.ndarray:
-    """Degrees of freedom (N, 2) that jumped, 'x'."""
+    """Which degrees of freedom jumped (N, 2), marked by 'x'."""
     return np.array([[c == 'x' for c in row] for row in rows])
 
 
 def descendants(ancestors: list[int], jumped: np.ndarray) -> Hypotheses:
-    """Hypotheses that come from some modes, heaviest first."""
+    """Hypotheses that descend from the given modes, heaviest first."""
     new = new_hypotheses(np.zeros(jumped.shape), np.zeros(len(jumped)))
     return replace(new, ancestors=np.array(ancestors), jumped=jumped)
 
@@ -29,13 +29,13 @@ def descendants(ancestors: list[int], jumped: np.ndarray) -> Hypotheses:
 @pytest.mark.parametrize(
     ('ancestors', 'jumped', 'expected'),
     [
-        # Everybody goes on, in another order.
+        # All continue, in another order.
         ([2, 0, 1], jumps('..', '..', '..'), [3, 1, 2]),
-        # Of two that came from one, the heaviest goes on.
+        # Of two descendants of one mode, the heavier keeps the identity.
         ([1, 1, 0], jumps('..', '..', '..'), [2, 4, 1]),
-        # One that moved goes on before a heavier one that jumped.
+        # One that moved keeps the identity before a heavier one that jumped.
         ([1, 1, 0], jumps('x.', '..', '..'), [4, 2, 1]),
-        # Where all have jumped with a limb, the heaviest goes on.
+        # Where a limb of each has jumped, the heaviest keeps the identity.
         ([1, 1, 0], jumps('x.', '.x', '..'), [2, 4, 1]),
         # Modes that were placed again have no ancestor.
         ([1, 2, 0], jumps('xx', '..', '.x'), [4, 3, 1]),
@@ -48,7 +48,7 @@ def test_the_heaviest_descendant_keeps_the_number(ancestors, jumped, expected):
     modes = replace(Modes.blank(3, 2), identities=before)
     found = identities.of(descendants(ancestors, jumped), modes)
     assert found.tolist() == expected
-    # A number is given once, even where a mode has ended.
+    # A number is given only once, even after its mode has ended.
     modes = replace(modes, identities=found)
     after = identities.of(descendants([0, 0], jumps('..', '..')), modes)
     assert after.tolist() == [expected[0], max(3, *expected) + 1]
@@ -70,7 +70,7 @@ def test_numbers_of_a_track(human32, camera, filmed):
             found.append(tracker.estimate.modes.identities.tolist())
         runs.append(found)
         assert found[0][0] == 1
-        # A new track begins with 1 again.
+        # A new track starts with 1 again.
         tracker.reset(start)
         tracker.step(images[0], 0)
         assert tracker.estimate.modes.identities[0] == 1

@@ -1,4 +1,4 @@
-"""Starts from joints that a known pose has in the image, and from silhouettes."""
+"""Starts from the image joints of a known pose, and from silhouettes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def walk(human32):
 
 
 def exact(keypoints_of, body, pose, sigma=1.0) -> Keypoints:
-    """Joints where they are, said to be uncertain by sigma."""
+    """Exact joints as keypoints with standard deviation sigma."""
     seen = keypoints_of(body, pose, 0.0)
     covariances = np.tile(sigma**2 * np.eye(2), (len(seen.names), 1, 1))
     return Keypoints(seen.names, seen.pixels, covariances, seen.confidences)
@@ -36,14 +36,14 @@ def joints_from_pelvis(body, poses):
 
 
 def errors(body, poses, true_body, pose):
-    """Distances (M, J) of the joints from where they are, both seen from the pelvis, m."""
+    """Joint errors (M, J) relative to the pelvis, m."""
     truth = joints_from_pelvis(true_body, pose[None])
     return np.linalg.norm(joints_from_pelvis(body, poses) - truth, axis=2)
 
 
 @pytest.fixture(scope='module')
 def known(human32, camera, keypoints_of, motion):
-    """Keypoints and start of a person whose lengths were measured."""
+    """Keypoints and start of a person with measured lengths."""
     keypoints = exact(keypoints_of, human32, motion[6])
     subject = Subject(0, keypoints, dict(human32.segment_lengths))
     return keypoints, start_from_keypoints(human32, camera, subject)
@@ -59,7 +59,7 @@ def test_the_true_pose_is_among_those_of_known_lengths(human32, motion, known):
 
 
 def test_measured_lengths_are_kept(human32, known):
-    """To the centimetre that measuring errs by."""
+    """They are kept to a centimetre, the error of measurements."""
     _, start = known
     found, wanted = start.body.segment_lengths, human32.segment_lengths
     assert max(abs(found[name] - wanted[name]) for name in wanted) < 0.015
@@ -75,7 +75,7 @@ def test_poses_explain_the_joints_in_different_ways(camera, known):
     gaps = np.linalg.norm(good[:, None] - good[None], axis=3).max(2)
     apart = gaps[~np.eye(len(good), dtype=bool)]
     assert apart.min() > 0.03
-    # Nearly the same image, but somewhere a joint is elsewhere in depth.
+    # The images are nearly equal, but some joint has another depth.
     assert apart.max() > 0.15
 
 
@@ -84,7 +84,7 @@ def test_every_heading(human32, camera, keypoints_of, walk, turn):
     pose = walk[3].copy()
     pose[human32.dof_names.index('root_z')] += turn
     poses = poses_from_keypoints(human32, camera, exact(keypoints_of, human32, pose))
-    # The lengths were fitted with the pose within a centimetre; here the model's are taken.
+    # The lengths were fitted with the pose to a centimetre; here the model's are used.
     error = errors(human32, poses, human32, pose).mean(1)
     assert error.min() < 0.05
 
@@ -102,7 +102,7 @@ def test_a_stature_stands_for_unknown_lengths(human32, camera, keypoints_of, wal
 
 
 def test_without_any_length_the_shape_is_right_up_to_scale(human32, camera, keypoints_of, walk):
-    """One view tells no size: that of the model is taken, and the depth is in proportion."""
+    """One view does not determine the size; the model's is used, with proportional depth."""
     person = human32.with_stature(1.9)
     subject = Subject(0, exact(keypoints_of, person, walk[0]), {}, None)
     start = start_from_keypoints(human32, camera, subject)
@@ -134,7 +134,7 @@ def test_joints_on_one_point_are_refused(human32, camera):
 
 
 def test_poses_from_an_outline(human32, camera, walk):
-    """Everywhere as high as the silhouette and in its middle, one every 45 degrees."""
+    """Poses have the height and the centre of the silhouette, one every 45 degrees."""
     (mask,) = render_silhouettes(human32, walk[:1], camera)
     image = np.zeros((camera.height, camera.width, 3), np.uint8)
     outline = observe(image, mask, wanted=('coverage',)).outline

@@ -1,4 +1,4 @@
-"""Weights by what became of the modes, against all histories one by one."""
+"""Lagged weights of modes, compared with an enumeration of all histories."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def mixture(weights):
 
 
 def forward(images, seed):
-    """A forward recursion as the filter's, over random numbers.
+    """A forward recursion like the filter's, with random numbers.
 
-    Each image has hypotheses that go on from the modes before, evidence, two ways to face whose
-    masses are set by something else, and modes that each stand for a group of hypotheses.
+    Each image has hypotheses that continue the previous modes, evidence, two facings with given
+    masses, and modes that each represent a group of hypotheses.
 
     Returns:
         Of each image the weights of its modes, their origins, and the factors (K, N) and (N,) by
@@ -54,7 +54,7 @@ def forward(images, seed):
 
 
 def by_all_histories(recursion, t):
-    """Weights of the modes of image t: the sum over all ways through the images."""
+    """Weights of the modes of image t, as a sum over all paths through the images."""
     wanted = np.zeros(len(recursion[t][0]))
     counts = [len(recursion[0][0]), *(len(x[2][2]) for x in recursion[1:])]
     for path in itertools.product(*map(range, counts)):
@@ -74,7 +74,7 @@ def test_weights_are_the_sum_over_all_histories(seed):
     for t, (weights, origins, _) in enumerate(recursion):
         found += lagged.update(t, mixture(weights), origins)
     assert [one.stamp for one in found] == [0, 1]
-    # Image 0 has left before the last one came.
+    # Image 0 has left the window before the last one arrived.
     wanted = by_all_histories(recursion[:4], 0)
     assert found[0].posterior.weights == pytest.approx(wanted, abs=1e-12)
     found += lagged.finish()
@@ -82,7 +82,7 @@ def test_weights_are_the_sum_over_all_histories(seed):
     for one in found[1:]:
         wanted = by_all_histories(recursion, one.stamp)
         assert one.posterior.weights == pytest.approx(wanted, abs=1e-12)
-    # The newest image has what was published, and the others have not.
+    # Only the newest image has the published weights.
     assert found[-1].posterior == mixture(recursion[-1][0]).normalised()
     assert np.abs(found[1].posterior.weights - recursion[1][0]).max() > 0.01
 
@@ -104,7 +104,7 @@ def test_origins_of_other_modes_are_refused(origins):
 
 
 def test_the_weights_of_a_tracker(filmed, camera, human32, keypoints_of):
-    """Of a rendered person: the sum over all histories of four images at a time."""
+    """Compares a tracked rendered person with sums over all histories of four images."""
     poses, images, empty = filmed('reach', 0.6, camera)
     tracker = Tracker(human32, camera, SMALL, BackgroundModel.from_image(empty))
     start = GaussianMixture(np.ones(1), poses[:1], 0.02 * np.eye(human32.dimension)[None])

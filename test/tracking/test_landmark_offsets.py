@@ -1,4 +1,4 @@
-"""Offsets of the landmarks of one person, learned beside the poses."""
+"""Landmark offsets of one person, learned together with the poses."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ DT = 1.0 / 30.0
 
 
 def seen_at(pose, own=OWN) -> Keypoints:
-    """What a detector says of a person whose landmarks have offsets of their own."""
+    """Keypoints of a person with individual landmark offsets."""
     scheme = schemes()['mediapipe33']
     n = len(scheme.names)
     unknown = np.full((n, 2, 2), np.nan)
@@ -39,7 +39,7 @@ def seen_at(pose, own=OWN) -> Keypoints:
 
 @pytest.fixture(scope='module')
 def poses():
-    """A person who dances for four seconds, 3 m away."""
+    """Poses of a person who dances for four seconds, 3 m away."""
     result = procedural_motion('dance', BODY, 4.0, 30.0, 1).copy()
     result[:, :3] += np.array([0.0, 0.0, 3.0]) - result[:, :3].mean(0)
     return result
@@ -70,7 +70,7 @@ def test_offsets_of_a_person_are_found_within_their_prior(poses):
 
 
 def test_a_second_counts_the_same_at_every_rate(poses):
-    """Above `RATE` images do not count more; one image says little."""
+    """Above `RATE` more images add no information; one image has little."""
     known = after(poses[:120])
     often = LandmarkOffsets()
     for pose in poses[:120]:
@@ -107,7 +107,7 @@ def test_other_landmarks_and_joints_begin_anew(poses):
 
 
 def learned_by_tracker(poses, settings):
-    """Landmarks that a tracker has learned of after some images of a person, and after a reset."""
+    """Landmarks with learned offsets after some images of a person, and after a reset."""
     mask = np.zeros((CAMERA.height, CAMERA.width), dtype=np.uint8)
     tracker = Tracker(BODY, CAMERA, settings)
     tracker.reset(GaussianMixture(np.ones(1), poses[:1], 1e-3 * np.eye(BODY.dimension)[None]))

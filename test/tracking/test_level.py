@@ -1,4 +1,4 @@
-"""Tracks before a camera on its side: they are those before an upright one, turned."""
+"""Tracks with a camera on its side are the turned tracks of an upright camera."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def by_keypoints() -> TrackerSettings:
 
 
 def tracked(body, camera, keypoints_of, poses, up: np.ndarray, level: np.ndarray) -> Estimate:
-    """A tracker after images of a camera turned by a level, with this vertical given."""
+    """The estimate after images of a camera turned by a level, with a given vertical."""
     image = np.full((camera.height, camera.width, 3), 90, np.uint8)
     tracker = Tracker(body, camera, by_keypoints(), known_ground=KnownGround(up))
     middle = np.array([camera.cx, camera.cy])

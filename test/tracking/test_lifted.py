@@ -1,4 +1,4 @@
-"""Experts that know depth, in the tracker: what they are given, and what they change."""
+"""Experts that know depth, in the tracker: their inputs and their effect."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def settings(**values):
 
 @pytest.fixture(scope='module')
 def walk():
-    """Poses and keypoints of somebody who walks."""
+    """Poses and keypoints of a walking person."""
     poses = procedural_sequence('walk', BODY, 1.0, 0).poses[:10].copy()
     poses[:, :3] += np.array([0.1, 0.1, 4.0]) - poses[0, :3]
     joints = BODY.joint_positions(poses)
@@ -39,7 +39,7 @@ def walk():
 
 
 def observed(tracker, monkeypatch):
-    """Keypoints that a tracker sees, image by image."""
+    """The keypoints that a tracker receives, image by image."""
     seen, observer = [], tracker._observer
     view = observer.view
 
@@ -78,7 +78,7 @@ def test_a_guess_in_space_is_pooled_with_them(walk, monkeypatch):
 
 
 def test_a_true_guess_tells_towards_from_away(walk):
-    """Depths of a pose decide which way a limb points that keypoints leave open."""
+    """Depths of a pose decide which way a limb points where keypoints leave it open."""
     _, joints, seen = walk
     hips = BODY.skeleton.joint_index(HIPS)
     guesses = [x - x[hips].mean(0) for x in joints]
@@ -96,7 +96,7 @@ def test_a_true_guess_tells_towards_from_away(walk):
 
 
 def test_a_mixture_that_is_wrong_costs_little(walk):
-    """Who says that everybody is turned round is not believed against the keypoints' own poses."""
+    """A mixture that turns everybody around does not prevail over the keypoints' own poses."""
     _, joints, seen = walk
     hips = BODY.skeleton.joint_index(HIPS)
     tracker = Tracker(BODY, CAMERA, settings(lifter=''), seed=0)

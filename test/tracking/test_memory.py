@@ -1,4 +1,4 @@
-"""A tracker keeps nothing of an image but what it needs for the next ones."""
+"""A tracker keeps only as much of an image as it needs for the next ones."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from hmt_ros.tracking import Status, Subject, Tracker, TrackerSettings
 
 START = 10**9
 SMALL = Camera(110.0, 110.0, 59.5, 44.5, 120, 90)
-# A small search: what is kept of an image does not depend on it.
+# A small search, because the memory kept of an image does not depend on it.
 SETTINGS = TrackerSettings(candidates=8, max_hypotheses=4, searched_chains=1, combinations=32)
-# Bytes that a track may gain from the first number of images to the last: less than seven of its
+# Bytes that a track may grow by between the two numbers of images: less than seven of its
 # images take. Caches of the bodies that a track learns are full after about a hundred images.
 FIRST, LAST, BOUND = 160, 320, 200_000
 
@@ -33,7 +33,7 @@ def test_a_track_does_not_grow(filmed):
     tracemalloc.start()
     try:
         for i in range(LAST):
-            # To the end of the film and back.
+            # Forwards to the end of the film and back.
             t = turn - abs(i % (2 * turn) - turn)
             tracker.step(images[t], START + 10**8 * i)
             if i + 1 in (FIRST, LAST):

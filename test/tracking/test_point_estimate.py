@@ -1,4 +1,4 @@
-"""The point estimate: the pose of least expected distance, never between two ways to face."""
+"""The point estimate minimises the expected distance, and is never between two facings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def mixture(poses, weights=(1.0,)):
 
 
 def various(body, pose, rng, spread, weights):
-    """Modes around a pose that face as it does."""
+    """Modes around a pose with the same facing."""
     poses = pose + spread * rng.normal(size=(len(weights), len(pose)))
     return mixture(np.clip(poses, body.lower, body.upper), weights)
 
@@ -52,7 +52,7 @@ def test_no_mode_and_no_mean_is_nearer_to_the_modes(human37, pose, seed):
     distance = expected_distance(human37, posterior, found)
     others = [*posterior.means, weights @ posterior.means]
     assert distance < min(expected_distance(human37, posterior, x) for x in others)
-    # The place of the person is the mean.
+    # The person's position is the mean.
     assert found[:3] == pytest.approx(weights @ posterior.means[:, :3], abs=1e-9)
 
 
@@ -82,7 +82,7 @@ def test_it_trembles_less_than_the_modes(human37, pose):
 def test_it_faces_the_likelier_way(human37, pose, weights, wanted):
     both = np.concatenate([pose[None], reverse_depth(human37, pose[None])])
     found = point_estimate(human37, mixture(both[[0, 0, 1]], weights))
-    # No pose between the two ways.
+    # No pose between the two facings.
     assert found == pytest.approx(both[wanted], abs=1e-9)
 
 

@@ -14,7 +14,7 @@ SAME, CAP = 0.02, 0.3
 
 
 def distance(a, b, same=SAME, cap=CAP):
-    """Mean of the capped distances of the joints, less what counts as nothing."""
+    """Mean of the capped distances of the joints, less the distance that counts as zero."""
     gaps = [min(float(np.sqrt(((p - q) ** 2).sum())), cap) for p, q in zip(a, b)]
     return max(sum(gaps) / len(gaps) - same, 0.0)
 
@@ -26,7 +26,7 @@ def objective(joints, weights, chosen):
 
 
 def greedy(joints, weights, count):
-    """Heaviest first, then what lessens the objective most, while anything does."""
+    """The heaviest, then whatever lowers the objective most, until nothing lowers it."""
     chosen = [int(np.argmax(weights))]
     while len(chosen) < count:
         now = objective(joints, weights, chosen)
@@ -71,7 +71,7 @@ def test_choice_is_near_the_best_of_all_subsets(seed):
 
 
 def test_well_separated_groups_are_each_kept_once():
-    """Three heaps a metre apart: one of each, and their weights summed."""
+    """Three groups a metre apart: one of each is chosen, and their weights are summed."""
     rng = np.random.default_rng(0)
     heap = np.repeat(np.arange(3), 7)
     joints = np.zeros((21, 5, 3))

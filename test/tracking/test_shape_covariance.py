@@ -1,4 +1,4 @@
-"""What a start knows of lengths is what the estimate of the shape goes on from."""
+"""The covariance of the lengths at a start is where the estimate of the shape begins."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hmt_ros.tracking.shape_estimation import ShapeEstimate
 
 @pytest.mark.parametrize('size', [1.0, 0.05])
 def test_an_estimate_starts_with_the_covariance_of_the_lengths(size):
-    """Down to the deviation that no length falls below."""
+    """Down to the lower bound of the standard deviation of a length."""
     body = load_body('human37')
     body = replace(body, length_covariance=size**2 * body.length_covariance)
     count = len(body.skeleton.lengths)
@@ -43,7 +43,7 @@ def test_a_start_leaves_the_size_open_but_not_the_proportions(
     def deviation(body, direction) -> float:
         return float(np.sqrt(direction @ body.length_covariance @ direction))
 
-    # One view does not tell the size, so that lengths err together.
+    # One view does not determine the size, so the errors of lengths are correlated.
     assert deviation(free, rates) > 0.7 * deviation(human32, rates)
     assert deviation(measured, rates) < 0.021
     names = human32.skeleton.length_names

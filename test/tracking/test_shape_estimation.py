@@ -1,4 +1,4 @@
-"""The estimate of the shape: against brute force, against true shapes, and what it keeps to."""
+"""Shape estimation, compared with brute force and true shapes, and its constraints."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def deviations_of(estimate):
 class Toy(ShapeEstimate):
     """An estimate whose images are linear measurements y = A theta + B x with noise 1.
 
-    A pose is known besides with precision 1 around 0; the energy is that of both.
+    The pose also has a prior of precision 1 around 0; the energy is the sum of both.
     """
 
     def __init__(self, body, by_shape, by_pose, measured):
@@ -104,9 +104,9 @@ class Toy(ShapeEstimate):
 
 
 def toy(body, seed, noise=2e-3, measurements=120, pose_size=6):
-    """Measurements of some shape, which is far from none and within what people differ by.
+    """Measurements of a shape that differs clearly from the mean, within the range of people.
 
-    The first variables of the pose, so many, are measured with it.
+    The first `pose_size` variables of the pose are measured, too.
     """
     rng = np.random.default_rng(seed)
     size = ShapeSpace(body).size
@@ -134,7 +134,7 @@ def update(estimate, pose, trust=1.0):
 @pytest.mark.parametrize('trust', [1.0, 0.35])
 @pytest.mark.parametrize('start', [0.0, 0.1])
 def test_an_update_is_joint_least_squares_of_shape_and_pose(human37, trust, start):
-    """Wherever the pose was linearised: the measurements are linear."""
+    """For any linearisation point of the pose, because the measurements are linear."""
     estimate, _ = toy(human37, 0)
     d = estimate.by_pose.shape[1]
     prior = np.linalg.inv(estimate.covariance)
@@ -167,7 +167,7 @@ def test_information_only_shrinks_what_is_not_known(human37):
 
 
 def test_many_images_tell_no_more_than_their_common_error_lets_them(human37):
-    """Images that repeat each other: 1 / c of one is believed, and the prior of people stays."""
+    """Repeated images count as 1 / c of one at most, and the prior of people remains."""
     estimate, _ = toy(human37, 2)
     prior = np.linalg.inv(estimate.covariance)
     gained = []
@@ -194,7 +194,7 @@ def test_steps_and_shapes_have_limits(human37):
     assert all(min(part.radii) > 0 for part in estimate.body.flesh.parts)
 
 
-# What an image says of shape and pose.
+# Evidence of an image on shape and pose.
 
 
 def places_of(body, parts):
@@ -204,7 +204,7 @@ def places_of(body, parts):
 
 
 def energy_over_shape(space, pose, observation, name):
-    """Function of the shape: the energy of a term of the points that now are on the contour."""
+    """Energy of a term as a function of the shape, for the points now on the contour."""
     body, term = space.body, SILHOUETTE[name]
     frames = forward(body.skeleton, pose[None])
     surface = oracle.project_surface(body, CAMERA, frames)
@@ -228,7 +228,7 @@ def energy_over_shape(space, pose, observation, name):
 
 @pytest.mark.parametrize('name', NAMES)
 def test_gradients_over_the_shape_at_material_points(human37, poses, observation, name):
-    """Points of the contour stay where they are on the skin, which grows under them."""
+    """Points of the contour are fixed on the skin, which grows with the shape."""
     settings = LikelihoodSettings.of_terms(**{name: SILHOUETTE[name]})
     likelihood = ImageLikelihood(human37, CAMERA, settings)
     estimate, space = ShapeEstimate(human37), ShapeSpace(human37)
@@ -270,7 +270,7 @@ def test_curvatures_of_keypoints_are_derivatives_of_their_gradients(human37, pos
         ]
         difference = np.stack(columns, axis=1)
         assert np.allclose(difference, wanted, atol=1e-6 * np.abs(wanted).max())
-    # Keypoints say nothing of the flesh.
+    # Keypoints have no information on the flesh.
     assert not found.curvature[space.lengths :].any()
 
 
@@ -295,7 +295,7 @@ def test_gradient_and_covariance_of_poses_that_give_way(human37, poses, observat
     assert held[1, elbow] == (gradient[1, elbow] < 0)
 
 
-# Of persons whose shape is known.
+# Persons of known shape.
 
 
 def fitted(model, person, poses, rounds=2):
@@ -328,7 +328,7 @@ def stout(human37):
 
 
 def test_flesh_comes_nearer_to_the_true_one(human37, stout, poses):
-    """Of a walk that is seen from the side: depths come to light, and widths hardly."""
+    """A walk seen from the side shows depths, but hardly any widths."""
     estimate = fitted(human37, stout, poses[:3])
     known = deviations_of(estimate)
     for name in ('trunk_depth', 'thigh_depth', 'shin_depth'):
@@ -375,14 +375,14 @@ def test_what_is_considered_is_that_of_the_uncertain_shape(human37, poses, obser
         assert np.allclose(found[k], moved @ estimate.covariance @ moved.T)
         assert np.linalg.eigvalsh(found[k])[0] > -1e-12
     before = np.trace(found, axis1=1, axis2=2)
-    # A shape that is known better is considered less.
+    # A better known shape contributes less covariance.
     estimate.covariance = 0.25 * estimate.covariance
     found = estimate.considered(posterior.likelihood, observation, poses[:2], covariances)
     assert np.trace(found, axis1=1, axis2=2) == pytest.approx(0.25 * before)
 
 
 def test_keypoints_tell_nothing_of_the_size(human37, poses):
-    """A person of twice the size at twice the distance looks alike, however far angles give way."""
+    """A person of twice the size at twice the distance looks the same."""
     settings = TrackerSettings(
         likelihood=LikelihoodSettings.of_terms(keypoints=TermSettings(1.0, 1.0, np.inf))
     )

@@ -1,4 +1,4 @@
-"""Where silhouettes come from: masks of a segmenter, and backgrounds that show the person."""
+"""Sources of silhouettes: masks of a segmenter, and backgrounds that show the person."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from hmt_ros.tracking import Status, Subject, Tracker, TrackerSettings
 from test.tracking.test_tracker import best_error, in_bytes
 
 FRAME = 100_000_000
-# Feet rest only where the camera is known to stand still, which a background tells.
+# Without ground terms, because feet only rest if a background shows that the camera is fixed.
 SETTINGS = TrackerSettings(candidates=8, max_hypotheses=4, ground=GroundSettings(0.0, 0.0))
 
 
 @pytest.fixture(scope='module')
 def film(filmed, camera):
-    """Poses, images and the empty scene of a person who walks."""
+    """Poses, images and the empty scene of a walking person."""
     return filmed('walk', 0.6, camera)
 
 
@@ -33,7 +33,7 @@ def subject(film, human32, keypoints_of) -> Subject:
 
 
 def test_masks_replace_the_background(film, subject, human32, camera):
-    """The same with and without a background; somebody else in the mask does not matter."""
+    """Results do not depend on a background, nor on another person in the mask."""
     poses, images, empty = film
     masks = render_silhouettes(human32, poses, camera)
     masks[1:, 20:40, 5:15] = True
@@ -82,7 +82,7 @@ def crossing(human32, camera):
 
 
 def test_a_background_with_the_person_in_it_is_noticed_and_mended(crossing, human32, camera):
-    """As the person leaves the place where the background was learned."""
+    """It is noticed when the person leaves the place where the background was learned."""
     poses, images, empty = crossing
     silhouettes = Silhouettes(BackgroundModel())
     for i in range(21):
@@ -96,7 +96,7 @@ def test_a_background_with_the_person_in_it_is_noticed_and_mended(crossing, huma
     for image, pose in zip(images[4:], poses[4:], strict=True):
         silhouettes.complete(image, human32, camera, pose[None])
         doubted.append(silhouettes.doubted)
-    # Once, from the image on in which the person has left.
+    # Only once, from the image in which the person has left.
     assert doubted == sorted(doubted, reverse=True)
     assert 10 < doubted.index(False) < 31
     mask = render_silhouettes(human32, poses[-1:], camera)[0]
@@ -109,7 +109,7 @@ def test_a_background_with_the_person_in_it_is_noticed_and_mended(crossing, huma
 def test_tracking_where_the_background_was_learned_with_the_person_in_it(
     crossing, human32, camera, keypoints_of
 ):
-    """With keypoints and without silhouettes at first, then with silhouettes alone."""
+    """First with keypoints and without silhouettes, then with silhouettes alone."""
     poses, images, _ = crossing
     tracker = Tracker(human32, camera, SETTINGS)
     seen = keypoints_of(human32, poses[4])

@@ -1,4 +1,4 @@
-"""Starts with a depth image: distance and stature, which one image alone hardly tells."""
+"""Starts with a depth image, which determines distance and stature."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_a_start_from_keypoints_finds_distance_and_stature(tall, camera, keypoin
 
 @pytest.mark.parametrize('wall', [0.5, 1.0, 9.0])
 def test_depth_of_something_else_does_not_spoil_a_start(tall, camera, keypoints_of, wall):
-    """A person of the size that such a depth says does not exist."""
+    """Such a depth implies an impossible size of the person."""
     body, poses, _, depths, _ = tall
     model, seen = load_body('human37'), subject_of(keypoints_of(body, poses[0], 1.0))
     plain = start_from_keypoints(model, camera, seen)
@@ -102,7 +102,7 @@ def test_a_box_starts_at_the_depth_of_the_person(tall, camera):
 
 @pytest.fixture(scope='module')
 def tracked(tall, camera, keypoints_of):
-    """Distance errors (T,) m and final statures, by what the tracker is given."""
+    """Distance errors (T,), m, and final statures, by inputs of the tracker."""
     body, poses, images, depths, empty = tall
     true = body.joint_positions(poses)
     found = {}
@@ -133,7 +133,7 @@ def test_depth_makes_the_distance_more_certain(tracked):
 
 
 def test_depth_that_is_not_registered_does_no_harm(tracked):
-    """Shifted by 20 px of a person some 50 px wide: it is doubted, see `tracked`."""
+    """It is shifted by 20 px for a person about 50 px wide, and is doubted, see `tracked`."""
     assert tracked['shifted'][0].max() < tracked['no depth'][0].max() + 0.02
 
 

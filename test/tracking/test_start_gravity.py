@@ -1,4 +1,4 @@
-"""Starts of people whom a camera sees that looks down."""
+"""Starts of people seen by a camera that looks down."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def body():
 
 @pytest.fixture(scope='module')
 def standing(body) -> np.ndarray:
-    """(d,) somebody upright, seen by the camera that looks down."""
+    """Pose (d,) of an upright person, seen by the camera that looks down."""
     return procedural_motion('reach', body, 0.2, 10.0, 3, viewpoint=DOWN)[0]
 
 
@@ -66,7 +66,7 @@ def test_only_the_lean_costs_at_the_start(body, standing):
 
 
 def test_a_start_is_upright_against_gravity(body, camera, keypoints_of, standing):
-    """Clicks are poor and the size is unknown, so that the lean decides the depths of joints."""
+    """Clicks are inaccurate and the size is unknown, so the lean decides the joints' depths."""
     keypoints = keypoints_of(body, standing, 3.0)
     subject = Subject(0, keypoints, {}, None)
     known, camera_axes = (

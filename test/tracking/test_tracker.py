@@ -1,4 +1,4 @@
-"""The tracker on short motions whose poses are known: joints as keypoints, and rendered images."""
+"""The tracker on short motions with known poses: joints as keypoints, and rendered images."""
 
 import multiprocessing
 from concurrent.futures import ThreadPoolExecutor
@@ -44,7 +44,7 @@ def keypoint_settings(**values):
             'likelihood': ONLY_KEYPOINTS,
             'flow_weight': 0.0,
             'estimate_shape': False,
-            'lifter': '',  # what experts add is tested apart
+            'lifter': '',  # experts have their own tests
             **values,
         }
     )
@@ -62,7 +62,7 @@ def subject(human32, motion, keypoints_of):
 
 @pytest.fixture
 def mixture(motion):
-    """A start around the first pose: the truth, and another that is 60 cm away."""
+    """A start around the first pose: the truth, and another pose 60 cm away."""
     means = np.stack([motion[0], motion[0]])
     means[1, 0] += 0.6
     return GaussianMixture(
@@ -81,7 +81,7 @@ def begun(human32, camera, black, motion, keypoints_of, subject):
 
 @pytest.fixture(scope='module')
 def started(begun, camera):
-    """Function (seed, tracker settings) -> a tracker that starts from there."""
+    """Function (seed, tracker settings) -> a tracker that starts from these poses."""
 
     def make(seed=0, **values):
         body, posterior = begun
@@ -94,7 +94,7 @@ def started(begun, camera):
 
 @pytest.fixture(scope='module')
 def follow(human32, black, motion, keypoints_of, started):
-    """Function (tracker or its settings) -> mixtures and errors of the best mode, by keypoints."""
+    """Function (tracker or its settings) -> mixtures, and errors of the best mode."""
 
     def run(frames=8, seed=0, body=human32, tracker=None, **values):
         if tracker is None:
@@ -110,7 +110,7 @@ def follow(human32, black, motion, keypoints_of, started):
 
 
 def best_error(body, mixture, true_body, pose):
-    """Least mean distance of the joints, seen from the pelvis, from where they are, m."""
+    """Mean joint error of the best mode relative to the pelvis, m."""
     joints, truth = body.joint_positions(mixture.means), true_body.joint_positions(pose[None])
     gaps = (joints - joints[:, :1]) - (truth - truth[:, :1])
     return np.linalg.norm(gaps, axis=2).mean(1).min()
@@ -152,7 +152,7 @@ def test_weights_of_the_likelihood_are_those_of_the_image_alone(
 ):
     """exp(-energy) at the modes of the posterior, times their volumes, with the ground off.
 
-    And the whole curvature: nothing is discounted, so that the mixture is exp(-energy) itself.
+    The full curvature is used, without discount, so that the mixture is exp(-energy) itself.
     """
     tracker, *_ = follow(frames=3, ground=OFF)
     validity = deepcopy(tracker.estimate.validity)
@@ -176,14 +176,14 @@ def test_weights_of_the_likelihood_are_those_of_the_image_alone(
         both = np.ix_(inside, inside)
         assert inside.sum() > len(inside) / 2
         assert np.allclose(precision[both], wanted[both], rtol=1e-6, atol=1e-3)
-    # All cues have one error model today; the mean over those that speak is among theirs.
+    # All cues have the same error model, so the mean over active ones is the same.
     shares = [errors.independent for errors in ERRORS.values()]
     assert min(shares) <= tracker.estimate.likelihood.errors.independent <= max(shares)
-    # What is not known of the lengths is beside it: of the place the distance, above all.
+    # Uncertain lengths add uncertainty to the position, mainly to the distance.
     unknown = tracker.estimate.likelihood.shape_covariance
     assert np.linalg.eigvalsh(unknown).min() > -1e-9
     assert np.diagonal(unknown)[:3].argmax() == 2
-    # Its log at the means is that of the image, without the prior of the body.
+    # Its log at the means is the image likelihood, without the prior of the body.
     term = of_keypoints.keypoint_term(seen, None)
     values = PoseEnergy(of_keypoints, (term,)).energy(likelihood.means).value
     assert len(likelihood) > 1
@@ -221,7 +221,7 @@ def test_trackers_in_threads_and_in_a_forked_process_give_the_same_bytes(follow)
 
 
 def test_other_body_sizes(follow, human32, camera, motion, keypoints_of):
-    """A child's lengths come with the subject; the model stays."""
+    """A child's lengths come from the subject; the model is the same."""
     child = human32.with_stature(1.3)
     lengths = child.segment_lengths
     subject = Subject(0, keypoints_of(child, motion[0]), lengths)
@@ -249,7 +249,7 @@ def test_reset_starts_over(follow):
 
 def test_waits_for_the_image_of_the_subject(human32, camera, black, subject, motion, keypoints_of):
     tracker = Tracker(human32, camera, keypoint_settings())
-    assert tracker.step(black, 5) == (None, None)  # nobody said what to start from
+    assert tracker.step(black, 5) == (None, None)  # there is no start
     tracker.reset(replace(subject, stamp_ns=3 * FRAME))
     for i in range(3):
         assert tracker.step(black, i * FRAME + 7) == (None, None)
@@ -259,12 +259,12 @@ def test_waits_for_the_image_of_the_subject(human32, camera, black, subject, mot
     posterior, likelihood = tracker.step(black, 3 * FRAME + 7, seen)
     assert tracker.estimate.status is Status.TRACKING
     assert posterior.dimension == likelihood.dimension == human32.dimension
-    # Nobody can be told from a background of black.
+    # No person can be separated from a black background.
     assert tracker.silhouettes.doubted
 
 
 def test_start_from_a_mixture(human32, camera, black, motion, keypoints_of, mixture):
-    """The image tells the components apart; the body stays as it is."""
+    """The image decides between the components; the body does not change."""
     tracker = Tracker(human32, camera, keypoint_settings())
     tracker.reset(mixture)
     assert tracker.estimate.status is Status.WAITING
@@ -281,7 +281,7 @@ def test_start_from_a_mixture(human32, camera, black, motion, keypoints_of, mixt
 def test_a_mode_goes_on_whatever_is_proposed(
     human32, camera, black, motion, keypoints_of, monkeypatch
 ):
-    """A limb and its flip have one image; only where the first one is anything is proposed."""
+    """A limb and its flip have the same image; only near the first one are there proposals."""
 
     def first_alone(search, sources, rng):
         still = np.zeros((1, 32), dtype=bool)
@@ -303,7 +303,7 @@ def test_a_mode_goes_on_whatever_is_proposed(
 
 
 def test_modes_move_on_where_nothing_is_seen(human37, camera, black, motion, keypoints_of):
-    """Keypoints of 10^5 px say nothing: modes go where their velocities take them."""
+    """Keypoints with errors of 10^5 px have no information: modes follow their velocities."""
     free = replace(ONLY_KEYPOINTS, prior_weight=0.0, self_intersection_sigma=np.inf)
     settings = keypoint_settings(likelihood=free, max_hypotheses=1, ground=OFF)
     tracker = Tracker(human37, camera, settings)
@@ -325,7 +325,7 @@ def test_modes_move_on_where_nothing_is_seen(human37, camera, black, motion, key
     wanted = transition @ np.concatenate([before.poses[0], before.velocities[0]])
     wanted = np.clip(wanted[: len(pose)], human37.lower, human37.upper)
     assert np.abs(posterior.means[0] - wanted).max() < 1e-4
-    # At rest after the same, they stay.
+    # Without velocity they stay.
     still = Tracker(human37, camera, settings)
     still.reset(start)
     for i in range(3):
@@ -334,7 +334,7 @@ def test_modes_move_on_where_nothing_is_seen(human37, camera, black, motion, key
 
 
 def test_without_keypoints_and_background_it_still_runs(human32, camera, motion, subject):
-    """Edges and texture of noise: poses stay near, weights are weights."""
+    """With edges and texture of noise, poses stay near and weights are valid."""
     rng = np.random.default_rng(0)
     settings = TrackerSettings(candidates=8, max_hypotheses=4)
     tracker = Tracker(human32, camera, settings)
@@ -349,12 +349,12 @@ def test_without_keypoints_and_background_it_still_runs(human32, camera, motion,
     assert best_error(tracker.estimate.body, pair[0], human32, motion[3]) < 0.3
 
 
-# Images, three good ones among them, after which a track is lost whose keypoints jumped: 0.4 s.
+# Images, including three good ones, until a track with jumped keypoints is lost: 0.4 s.
 LOST_WITHIN = 15
 
 
 def jumped(motion):
-    """Another pose, turned and two steps aside."""
+    """Another pose, rotated and two steps aside."""
     pose = motion[11].copy()
     pose[0] += 0.9
     pose[3] += 2.5
@@ -382,17 +382,17 @@ def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion
     assert max(misfits[found:]) < 0.1
     assert min(errors[3:found]) > 0.08
     assert max(errors[found:]) < 0.065
-    # The place too, not only the posture.
+    # The position, not only the posture.
     assert np.abs(posterior.means[:, :3] - other[:3]).max(1).min() < 0.25
-    # Modes that are placed again have no history, and the point estimate does not travel to them.
-    # One image tells the depth to about a tenth.
+    # Replaced modes have no history, and the point estimate jumps to them.
+    # One image determines the depth to about a tenth.
     assert begins == [i in (0, found) for i in range(len(begins))]
     assert np.abs(places[found][:2] - other[:2]).max() < 0.15
     assert abs(places[found][2] - other[2]) < 0.4
 
 
 def predicted(body, pose):
-    """What a regression may say of a pose: near it, or its back to the front."""
+    """A regression's prediction of a pose: near it, or with front and back exchanged."""
     means = np.stack([pose, pose])
     means[0, 6:] += 0.05
     means[1, 5] += np.pi
@@ -407,7 +407,7 @@ def test_a_prediction_starts_a_track(human32, camera, black, motion, keypoints_o
         seen = keypoints_of(human32, motion[i], 1.0, i)
         posterior, _ = tracker.step(black, i * FRAME, seen, predicted(human32, motion[1]))
         assert best_error(human32, posterior, human32, motion[i]) < 0.06
-    # The next track has nothing else to start from, either.
+    # The next track has no other start, either.
     tracker.reset()
     assert tracker.step(black, 0, keypoints_of(human32, motion[0])) == (None, None)
 
@@ -433,7 +433,7 @@ def test_a_lost_track_starts_anew_from_a_prediction(human32, started, black, mot
         assert statuses[-2] is Status.LOST
         assert (statuses[-1] is Status.TRACKING) == given
         errors[given] = best_error(tracker.estimate.body, posterior[:1], human32, other)
-    # Five keypoints hold little: the prior of the angles draws the pose away from the prediction.
+    # With few keypoints the prior of the angles pulls the pose away from the prediction.
     assert errors[True] < 0.6 * errors[False]
 
 
@@ -443,7 +443,7 @@ def test_nothing_becomes_certain_while_a_lost_track_is_sought(
     other, tracker = jumped(motion), started()
     for i in range(LOST_WITHIN + 20):
         seen = keypoints_of(human32, motion[i] if i < 3 else other, 1.0, i)
-        # Starts again in each image, at a place where nobody is.
+        # Restarts in each image, at a place without a person.
         prediction = (
             predicted(human32, motion[0]) if tracker.estimate.status is Status.LOST else None
         )
@@ -459,7 +459,7 @@ def test_nothing_becomes_certain_while_a_lost_track_is_sought(
 
 
 def test_predictions_are_among_the_hypotheses(human32, started, black, motion, keypoints_of):
-    """Nothing else finds the jump in its image."""
+    """No other proposal finds the jump in its image."""
     errors = {}
     for given in (False, True):
         tracker = started()
@@ -474,7 +474,7 @@ def test_predictions_are_among_the_hypotheses(human32, started, black, motion, k
 
 
 def test_who_jumps_is_found_where_the_keypoints_are(human32, started, black, motion, keypoints_of):
-    """As soon as the track is lost, and not before."""
+    """The new pose is found as soon as the track is lost, and not before."""
     tracker, errors, lost = started(), [], []
     for i in range(LOST_WITHIN + 3):
         pose = motion[i] if i < 3 else jumped(motion)
@@ -534,12 +534,12 @@ def test_a_proposal_that_is_not_in_the_list_is_refused(human32, camera):
 
 @pytest.fixture(scope='module')
 def film(filmed, camera):
-    """Poses, images and the empty scene of a person who walks."""
+    """Poses, images and the empty scene of a walking person."""
     return filmed('walk', 0.6, camera)
 
 
 def test_images_alone(film, human32, camera, keypoints_of):
-    """After the first image nothing but pixels; of one seed twice, with identical bytes."""
+    """After the first image only pixels are used; equal seeds give identical bytes."""
     poses, images, empty = film
     runs = []
     for seed in (5, 5, 6):
@@ -559,7 +559,7 @@ def test_images_alone(film, human32, camera, keypoints_of):
 
 
 class KnownHeight:
-    """A term that only knows how high above the floor the root is."""
+    """A term that only measures the height of the root above the floor."""
 
     def __init__(self, height):
         self.height = height

@@ -1,4 +1,4 @@
-"""A track whose legs no image shows says where people have them, and uses them once they show."""
+"""Legs outside the image have usual postures, and follow the evidence once they are seen."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ def without_legs(keypoints):
 
 @pytest.fixture(scope='module')
 def steps(human32, camera, motion, keypoints_of):
-    """Body, posterior, origins and identities of each image, and how many modes are kept."""
+    """Body, posterior, origins and identities of each image, and the number of modes kept."""
     tracker = Tracker(human32, camera, TrackerSettings(evaluation_budget=150))
     tracker.reset(GaussianMixture(np.ones(1), motion[:1], 0.01 * np.eye(32)[None]))
     black = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
@@ -47,7 +47,7 @@ def steps(human32, camera, motion, keypoints_of):
 
 
 def ankles(body, posterior):
-    """Mean (2, 3) of the ankles from the pelvis, and roots (2,) of their variances, m."""
+    """Mean (2, 3) of the ankles relative to the pelvis and standard deviations (2,), m."""
     which = body.skeleton.joint_index(('left_ankle', 'right_ankle'))
     places = body.relative_joints(posterior.means)[:, which]
     jacobians = body.joint_jacobians(posterior.means)

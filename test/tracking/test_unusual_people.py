@@ -1,4 +1,4 @@
-"""Gravity is known, and the person is not what the terms of the ground expect."""
+"""Known gravity, with people for whom the assumptions of the ground terms are wrong."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.tracking import KnownGround, Status, Subject, Tracker, TrackerSettings
 
 UP = np.array([0.0, -1.0, 0.0])
-# Angles of those who do not stand, deg; both sides.
+# Angles of non-standing postures, deg, for both sides.
 POSES: dict[str, dict[str, float]] = {
     'standing': {},
     'lying': {'root_x': -85.0, 'root_z': 90.0},
@@ -34,7 +34,7 @@ def pose_of(body, angles: dict[str, float]) -> np.ndarray:
 
 
 def followed(body, camera, keypoints_of, poses, *, shown=None, ground=None):
-    """The tracker after keypoints of poses (T, d), and its errors (T,), m, hips on hips."""
+    """The tracker after keypoints of poses (T, d), and its errors (T,), aligned at the hips, m."""
     likelihood = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
     settings = TrackerSettings(
         candidates=8, max_hypotheses=4, likelihood=likelihood, estimate_shape=False
@@ -65,10 +65,10 @@ def followed(body, camera, keypoints_of, poses, *, shown=None, ground=None):
 
 @pytest.mark.parametrize('name', POSES)
 def test_who_does_not_stand_is_followed(name, human37, camera, keypoints_of):
-    """The tails of lean, floor and balance are heavy: they bend nobody who lies or hangs."""
+    """Lean, floor and balance have heavy tails, so they do not bend people who lie or hang."""
     poses = np.tile(pose_of(human37, POSES[name]), (4, 1))
     _, errors = followed(human37, camera, keypoints_of, poses)
-    # Arms over the head may point towards the camera or away.
+    # Arms above the head may point towards the camera or away.
     assert errors[-1] < (0.25 if name == 'climbing' else 0.12)
 
 
@@ -100,7 +100,7 @@ def test_children_and_giants(stature, camera, keypoints_of):
 
 
 def test_a_camera_that_rolls_and_a_bump(human37, camera, keypoints_of):
-    """Gravity turns by 10 degrees about the optical axis at once, and then back."""
+    """Gravity suddenly rotates by 10 degrees about the optical axis, and then back."""
     poses = np.tile(pose_of(human37, {}), (3, 1))
     tracker, _ = followed(human37, camera, keypoints_of, poses, ground=KnownGround(UP))
     black = np.zeros((camera.height, camera.width, 3), np.uint8)

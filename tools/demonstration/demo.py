@@ -2,10 +2,10 @@
 
     python tools/demonstration/demo.py bags/reach -o build/demo --live
 
-Errors are those of the joints of the arms and legs that the detector has, with the middle of the
-hips in its true place, over the images in which both have an answer. Beside them stand how often
-the truth lies in the region that shall hold it with 90 %, how often nobody is said to be
-there though somebody is, and the mean over the clips of other people, from `benchmarks/results`.
+Errors are those of the arm and leg joints that the detector has, relative to the middle of the
+hips, over the images in which both have an answer. Other lines show the coverage of 90 % regions,
+the number of images in which a present person is reported absent, and the mean error over the
+clips of other people, from `benchmarks/results`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from msg_tools import BagReader
 JOINTS = tuple(name for name in EVALUATED_JOINTS if name != 'neck')
 REPORT = 'report'
 RESULTS = Path(__file__).resolve().parents[2] / 'benchmarks' / 'results' / 'tracking.md'
-# Names of the lines.
+# Titles of the lines.
 DETECTORS, OURS, SMOOTHED = (
     "error of the detector's own 3D",
     'error of the most probable pose',
@@ -51,7 +51,7 @@ CLIPS = 'error on the clips of other people, in the mean'
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the demonstration; 0: done, 1: bad input, which one line on stderr explains."""
+    """Runs the demonstration; returns 0, or 1 after bad input, which one line explains."""
     return run_command(_parser(), _demonstrate, argv)
 
 
@@ -79,7 +79,7 @@ def _parser() -> CommandParser:
 
 @dataclass(frozen=True)
 class _Poses:
-    """Poses (K, J, 3) by stamp, the heaviest first, of joints with names."""
+    """Joint names, and joint positions (K, J, 3) by timestamp, heaviest mode first."""
 
     names: tuple[str, ...]
     joints: dict[int, Array]
@@ -90,7 +90,7 @@ class _Poses:
         return _Poses(layer.joint_names, {t: x.joints for t, x in layer.mixtures.items()})
 
     def errors(self, truth: Truth, stamps: Iterable[int]) -> Array:
-        """Errors (T,) of the heaviest pose at some stamps, mm: means over joints."""
+        """Mean joint errors (T,) of the heaviest pose at some timestamps, mm."""
         joints = [x for x in JOINTS if x in self.names and x in truth.joint_names]
         result = []
         for stamp in stamps:
@@ -128,7 +128,7 @@ def _demonstrate(arguments: argparse.Namespace) -> int:
 
 
 def _scenes(truth: Path) -> dict[str, int]:
-    """What is done, and until which stamp; one scene where nothing says so."""
+    """End timestamps of the scenes by name; one scene if the truth has none."""
     if truth.is_file():
         with np.load(truth) as content:
             if {'scenes', 'until'} <= {*content}:
@@ -137,7 +137,7 @@ def _scenes(truth: Path) -> dict[str, int]:
 
 
 def _told(shown: Content, truth: Truth, rate: float, scenes: dict[str, int]) -> Iterator[str]:
-    """How far poses are off, how well that is known, and how fast they came."""
+    """Lines on errors of poses, their calibration, and the rate."""
     found = {layer.kind: _Poses.of(layer) for layer in shown.mixtures.layers if layer.joint_names}
     poses = {OURS: found['posterior']}
     if shown.detector is not None:
@@ -145,7 +145,7 @@ def _told(shown: Content, truth: Truth, rate: float, scenes: dict[str, int]) -> 
         poses = {DETECTORS: _Poses(shown.detector.joint_names, joints), **poses}
     if 'smoothed' in found:
         poses[SMOOTHED] = found['smoothed']
-    # All at the images in which each has an answer.
+    # All are compared in the images in which each has an answer.
     common = sorted(truth.joints.keys() & set.intersection(*({*x.joints} for x in poses.values())))
     parts = np.split(np.array(common), np.searchsorted(common, [*scenes.values()])[:-1])
     yield _row('', *scenes)
@@ -161,7 +161,7 @@ def _told(shown: Content, truth: Truth, rate: float, scenes: dict[str, int]) -> 
 
 
 def _told_of_clips() -> Iterator[str]:
-    """The mean over the clips of other people, as far as it is there."""
+    """Line on the mean over the clips of other people, if available."""
     if RESULTS.is_file():
         text = RESULTS.read_text('utf-8').partition('Other clips: errors')[2]
         rows = [[x.strip() for x in line.split('|')[1:-1]] for line in text.splitlines()]
@@ -179,7 +179,7 @@ def _row(what: str, *values: str) -> str:
 
 
 def _track(source: Path, target: Path, options: ReplayOptions, inputs: str) -> float:
-    """Tracks; returns the images a second."""
+    """Tracks the person; returns poses per second."""
     print(f'tracking the person in {source} by {inputs}', flush=True)
     start = time.monotonic()
     replayed = replay_bag(source, target, options, partial(tell_user, 'replay'))

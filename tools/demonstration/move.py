@@ -1,9 +1,9 @@
-"""Moves the avatar through the scenes, led by an own body of the avatar's lengths.
+"""Moves the avatar through the scenes, driven by a body model with the avatar's lengths.
 
     python move.py MPFB2 OUT.npz
 
-OUT gets the vertices of all images in the world, z up, the true joints, the camera, and the poses
-of the body that led the avatar.
+OUT contains the vertices of all images in the world, z up, the true joints, the camera, and the
+poses of the body model.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from hmt_ros.body import load_body
 from hmt_ros.body.kinematics import forward
 
 FPS = 10.0
-SOLE = 0.012  # m, of a shoe
+SOLE = 0.012  # thickness of a shoe's sole, m
 WIDTH, HEIGHT = 480, 360
-HALF_ANGLE = np.radians(24.0)  # of view, horizontal
+HALF_ANGLE = np.radians(24.0)  # half the horizontal field of view, rad
 VIEWPOINT = Viewpoint(distance=3.7, height=1.3, pitch=np.radians(5.0))
 SIDES = (('left', 'Left'), ('right', 'Right'))
-# Joints of our body, and the bones of the avatar at whose heads they are.
+# Bone of the avatar whose head is at each joint of the body model.
 BONES = {
     'pelvis': 'LowerBack', 'head': 'Head',
     **{
@@ -109,11 +109,11 @@ def lengths_of(avatar: Avatar) -> dict[str, float]:
 
 
 def turns_of(avatar, segments, body, poses) -> dict[str, np.ndarray]:
-    """How each bone is turned from its rest in each image, (T, 3, 3) in the world, by name."""
+    """Rotations (T, 3, 3) of each bone from its rest, in the world frame, by name."""
     own = np.einsum('ji,tsjk->tsik', VIEWPOINT.rotation, forward(body.skeleton, poses).rotations())
     up, sideways, right = np.eye(3)[2], np.eye(3)[0], -np.eye(3)[0]
     heads, tails = avatar.heads, avatar.tails
-    # Two directions of each segment: in its own frame, and of the avatar at rest.
+    # Axis of each segment in its own frame, and two directions of the avatar at rest.
     pairs = {
         'pelvis': (up, up, right),
         'left_clavicle': (up, up, right),
@@ -161,7 +161,7 @@ def turns_of(avatar, segments, body, poses) -> dict[str, np.ndarray]:
 
 
 def heads_of(avatar: Avatar, turns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Where the heads of the bones are, (T, 3), with the first in the origin."""
+    """Positions (T, 3) of the heads of the bones, relative to the first."""
     result: dict[str, np.ndarray] = {}
     for name in avatar.bones:
         if parent := avatar.parents[name]:
@@ -173,7 +173,7 @@ def heads_of(avatar: Avatar, turns: dict[str, np.ndarray]) -> dict[str, np.ndarr
 
 
 def _basis(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Axes (3, 3) in columns, from two directions."""
+    """Orthonormal axes (3, 3) in columns, from two directions."""
     a = first / np.linalg.norm(first)
     b = second - a * (a @ second)
     b /= np.linalg.norm(b)

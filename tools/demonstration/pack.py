@@ -1,8 +1,8 @@
-"""Writes the bag of the demonstration from rendered images, with what MediaPipe Pose sees in them.
+"""Writes the bag of the demonstration from rendered images, with keypoints of MediaPipe Pose.
 
     python pack.py MOTION.npz FOLDER BAG
 
-The noise of a sensor is added. /tf_static tells where the camera stands, as a robot would.
+Sensor noise is added. /tf_static contains the camera's pose, as on a robot.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def main(argv: list[str]) -> int:
     joints = viewpoint.to_camera(motion['joints'])
     stamps = START_NS + np.round(np.arange(len(joints)) * 1e9 / motion['fps']).astype(np.int64)
     pixels = camera.project(joints)
-    # Where no joint is in the image nobody is.
+    # The person counts as absent if no joint is in the image.
     seen = ((pixels > -0.5) & (pixels < np.array([width, height]) - 0.5)).all(2).any(1)
     messages, detector, rng = RosbagsMessages(), BlazePose(), np.random.default_rng(0)
     with BagWriter(target) as bag:

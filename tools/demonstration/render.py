@@ -1,8 +1,8 @@
-"""Renders the avatar in a room with Blender (the package bpy): one PNG an image, and empty.png.
+"""Renders the avatar in a room with Blender (package bpy): one PNG per image, and empty.png.
 
     python render.py MPFB2 MOTION.npz FOLDER
 
-The person wears a shirt, trousers and shoes: parts of the skin, pushed out along its normals.
+Shirt, trousers and shoes of the person are parts of the skin, shifted along its normals.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def main(argv: list[str]) -> int:
 
 
 def settings(motion) -> None:
-    """The camera and the renderer."""
+    """Sets up the camera and the renderer."""
     scene = bpy.context.scene
     camera = bpy.data.cameras.new('camera')
     camera.sensor_fit, camera.angle_x = 'HORIZONTAL', 2.0 * float(motion['half_angle'])
@@ -75,7 +75,7 @@ def shoot(path: Path) -> None:
 
 
 def material(name, colour, rough=0.6, noise=0.0, scale=20.0, *, painted=False, skin=False):
-    """A material of one colour, or of the colours of the vertices, with some noise on it."""
+    """A material with one colour, or with vertex colours, and some noise."""
     made = bpy.data.materials.new(name)
     made.use_nodes = True
     nodes, links = made.node_tree.nodes, made.node_tree.links
@@ -111,7 +111,7 @@ def material(name, colour, rough=0.6, noise=0.0, scale=20.0, *, painted=False, s
 
 
 def boards():
-    """The material of the floor: boards of wood with grain."""
+    """The material of the floor: wooden boards with grain."""
     made = bpy.data.materials.new('floor')
     made.use_nodes = True
     nodes, links = made.node_tree.nodes, made.node_tree.links
@@ -140,7 +140,7 @@ def boards():
 
 
 def box(size, place, look, turn=0.0, bevel=0.01) -> None:
-    """A box with round edges."""
+    """Adds a box with round edges."""
     bpy.ops.mesh.primitive_cube_add(size=1, location=place, rotation=(0, 0, turn))
     thing = bpy.context.object
     thing.scale = size
@@ -152,7 +152,7 @@ def box(size, place, look, turn=0.0, bevel=0.01) -> None:
 
 
 def cylinder(radius, height, place, look, top=None) -> None:
-    """A cylinder, or a cone with another radius at its top."""
+    """Adds a cylinder, or a cone with another radius at its top."""
     bpy.ops.mesh.primitive_cone_add(
         radius1=radius, radius2=top or radius, depth=height, location=place, vertices=32
     )
@@ -161,7 +161,7 @@ def cylinder(radius, height, place, look, top=None) -> None:
 
 
 def furnish(rng: np.random.Generator, motion) -> None:
-    """A living room: floor, walls, shelf with books, sofa, picture, plant, rug and table."""
+    """Adds a living room: floor, walls, shelf with books, sofa, picture, plant, rug and table."""
     bpy.ops.mesh.primitive_plane_add(size=14)
     bpy.context.object.data.materials.append(boards())
     wall, white = material('wall', (0.62, 0.60, 0.55), 0.9, 0.08, 3), material('white', (0.75,) * 3)
@@ -224,7 +224,7 @@ def furnish(rng: np.random.Generator, motion) -> None:
 
 
 def light() -> None:
-    """A window beside the camera, a lamp above, and the light of the sky."""
+    """Adds a window beside the camera, a lamp above, and the light of the sky."""
     for place, target, size, watt, colour in (
         ((3.3, 1.6, 2.0), (0, 0, 0.9), 1.6, 170, (1.0, 0.97, 0.92)),
         ((0, 1.0, 3.2), (0, 0, 0), 2.0, 90, (1.0, 0.93, 0.82)),
@@ -247,7 +247,7 @@ def light() -> None:
 
 
 def dress(avatar: Avatar) -> list:
-    """The person: objects, the vertices (n,) of each, and how far they are pushed out, (n,) m."""
+    """Parts of the person: object, indices (n,) of its vertices, and their shifts (n,), m."""
     rest, heads, parts = avatar.rest, avatar.heads, []
     skin_faces = avatar.part('body')
     up, everywhere = rest[:, 2], np.zeros(len(rest))

@@ -1,7 +1,7 @@
-"""What the person of the demonstration does: two scenes in one take of fifteen seconds.
+"""Motion of the person in the demonstration, one take of fifteen seconds.
 
-First they stand, point at the camera, then aside. Then they leave the image, come back, and sit
-down behind a desk that hides their legs.
+The person stands, points at the camera, then aside, leaves the image, comes back, and sits
+down behind a desk that hides the legs.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ from hmt_ros.body.body import Body
 from hmt_ros.inference.arrays import Array
 
 SECONDS = 15.0
-# What is done, and until when, s: points, walks out of the image and back, sits at the desk.
+# End of each scene, s: points, walks out of the image and back, sits at the desk.
 SCENES = {'points': 4.4, 'walks': 11.5, 'sits': SECONDS}
-STOOL, SEAT = (0.85, -0.40), 0.45  # its place on the floor, and its height, m
-DESK = (0.85, 0.62)  # its place on the floor, m
-# The way on the floor: time, s; place, m; heading, deg.
+STOOL, SEAT = (0.85, -0.40), 0.45  # position of the stool on the floor, and its height, m
+DESK = (0.85, 0.62)  # position on the floor, m
+# Path on the floor: time, s; position, m; heading, deg.
 WAY = np.array([
     [-1.0, -0.45, 0.00, 8], [4.4, -0.45, 0.00, 8], [5.0, -0.62, -0.01, 60],
     [5.5, -1.10, -0.03, 88], [6.9, -2.60, -0.10, 90], [7.2, -2.70, -0.12, 60],
     [7.6, -2.70, -0.15, -80], [8.2, -2.25, -0.15, -90], [10.3, 0.62, -0.10, -86],
     [10.8, 0.84, -0.06, -30], [11.2, 0.85, -0.05, 0], [17.0, 0.85, -0.05, 0],
 ])  # fmt: skip
-STEP, AIR = 0.45, 0.95 * 0.45  # s, of one step, and of that in the air
-WALK = (4.5, 11.4)  # s, when the feet step
-APART, LIFT = 0.085, 0.06  # m, from the way to a foot, and of a foot in the air
-SITS = (11.3, 12.4)  # s
+STEP, AIR = 0.45, 0.95 * 0.45  # duration of a step, and of its part in the air, s
+WALK = (4.5, 11.4)  # start and end of walking, s
+APART, LIFT = 0.085, 0.06  # distance of a foot from the path, and its height in the air, m
+SITS = (11.3, 12.4)  # start and end of sitting down, s
 # Directions of the right upper arm and forearm: to the person's right, ahead, up.
 AT_CAMERA = ((0.30, 0.80, -0.52), (0.02, 0.99, 0.10))
 ASIDE = ((0.97, 0.15, -0.20), (0.98, 0.20, 0.00))
@@ -55,7 +55,7 @@ ASIDE = ((0.97, 0.15, -0.20), (0.98, 0.20, 0.00))
 def demonstration(
     body: Body, time: Array, duration: float, heading: float | None, rng: np.random.Generator
 ) -> Plan:
-    """The plan of both scenes; nothing in it is random."""
+    """The plan of all scenes, without random parts."""
     del duration, heading, rng
     feet = [_foot(body, time, side) for side in range(2)]
     place, direction = way(time)
@@ -76,13 +76,13 @@ def demonstration(
 
 
 def way(time: Array | float) -> tuple[Array, Array]:
-    """Place (..., 2) on the floor and heading (...)."""
+    """Position (..., 2) on the floor, m, and heading (...), rad."""
     found = PchipInterpolator(WAY[:, 0], WAY[:, 1:])(time)
     return found[..., :2], found[..., 2] * DEGREE
 
 
 def _foot(body: Body, time: Array, side: int) -> tuple[Array, Array]:
-    """Ankle and toe (T, 3) of a foot that lands beside the way where the body will soon be."""
+    """Ankle and toe (T, 3) of a foot that lands beside the path, slightly ahead of the body."""
     start, end = WALK
     landings = np.append(-1.0, np.arange(start + STEP * (1 + side), end + STEP, 2 * STEP))
     places, headings = way(landings + 0.5 * STEP)
@@ -125,5 +125,5 @@ def _arms(body: Body, time: Array) -> dict[str, Array]:
 
 
 def _unit(direction: ArrayLike) -> Array:
-    """A direction with the length 1."""
+    """The direction, normalised."""
     return np.asarray(direction / np.linalg.norm(direction))

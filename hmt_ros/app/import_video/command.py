@@ -1,8 +1,8 @@
 """import-video: writes a video, its camera and the output of a detector into a bag for replay.
 
-The bag has the topics `/image/compressed` and `/camera_info` and, if known, `/keypoints`,
-`/keypoints_3d` and `/mask`, or `/detections` of several people. Each message has the stamp of its
-frame.
+The bag has the topics `/image/compressed` and `/camera_info`, and also `/keypoints`,
+`/keypoints_3d` and `/mask` if known, or `/detections` for several people. Each message has the
+stamp of its frame.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ KEYPOINTS, KEYPOINTS_3D, DETECTIONS = 'keypoints', 'keypoints_3d', 'detections'
 
 EPILOG = """\
 SOURCE is any video file that OpenCV reads, or a folder of images in the order of the numbers in
-their names. Images that are JPEG files are copied as they are. Stamps are the times in the video
-file, counted from --first-stamp. Phones write how they were held: the frames are turned upright.
+their names. JPEG images are copied unchanged. Stamps are --first-stamp plus the times in the
+video file. Frames of a phone are turned upright as the metadata of the file say.
 
---keypoints takes, under the names of the detector and in pixels of the upright frames,
+--keypoints takes these layouts, with the detector's names and in pixels of the upright frames:
   FILE.json  COCO results [{image_id, keypoints, score}] or annotations, MMPose, AlphaPose, a list
              of what Ultralytics' to_json gives for each frame
   FOLDER     a file for each frame: JSON of OpenPose, MMPose or Ultralytics, such as
@@ -69,10 +69,10 @@ file, counted from --first-stamp. Phones write how they were held: the frames ar
              keypoint: frame, name, u, v, confidence; time_s, in the video or of Unix, or stamp_ns
              may replace frame, and a column person keeps several persons apart; or DeepLabCut
   FILE.trc   markers in pixels, as Sports2D writes them
-An image_id, or the name of a file of keypoints or of a mask, is the name of the frame's file, or
-its last number is that of the frame, from --first-number on. What has confidence 0, or lies at
-(0, 0) or NaN, was not seen. Points without names have the order of --scheme, or the one of those
-of as many points in which bones have the lengths of people: see docs/video.md.
+An image_id, or the name of a keypoint or mask file, is the name of the frame's file, or its last
+number is the number of the frame, counted from --first-number. A point with confidence 0, or at
+(0, 0) or NaN, was not seen. Points without names have the order of --scheme or, without it, the
+order of as many points that gives human bone lengths: see docs/video.md.
 
 examples:
   import-video walk.mp4 -o walk --fov 60 --keypoints walk.json
@@ -131,7 +131,10 @@ def add_camera_arguments(parser: CommandParser, *, required: bool = True) -> Non
         help='horizontal field of view, from the left border of the upright image to the right',
     )
     camera.add_argument(
-        '--vertical-fov', type=angle, metavar='DEGREES', help='field of view from top to bottom'
+        '--vertical-fov',
+        type=angle,
+        metavar='DEGREES',
+        help='vertical field of view, from top to bottom',
     )
     camera.add_argument(
         '--camera',
@@ -181,12 +184,12 @@ def add_video_arguments(parser: CommandParser, *, camera_required: bool = True) 
     person = parser.add_argument_group('the person')
     found = person.add_mutually_exclusive_group()
     found.add_argument(
-        '--keypoints', type=Path, metavar='PATH', help='what a detector found, see below'
+        '--keypoints', type=Path, metavar='PATH', help='keypoints from a detector, see below'
     )
     found.add_argument(
         '--detector',
         choices=tuple(DETECTORS),
-        help='find keypoints with a detector that is installed, such as MediaPipe Pose',
+        help='find keypoints with an installed detector, such as MediaPipe Pose',
     )
     found.add_argument(
         '--people',
@@ -220,17 +223,18 @@ def add_keypoint_arguments(parser: argparse._ActionsContainer) -> None:
         type=person_choice,
         default=Choice(),
         metavar='WHICH',
-        help='person to import if there are several: largest in each frame; nearest to the one '
-        'before, from the largest on; at:X,Y or at:X,Y,T, who is there, px, at that time, s; '
-        'track:N, the N-th longest track, from 1; id:NAME, as the detector tracks them; or index:N,'
-        ' the N-th in the list of each frame, from 0 (default: nearest)',
+        help='person to import if there are several: largest in each frame; nearest to the '
+        'previous one, starting with the largest; at:X,Y or at:X,Y,T, the person at this '
+        'position, px, at this time, s; track:N, the N-th longest track, from 1; id:NAME, '
+        'an identity of the detector; or index:N, the N-th in the list of each frame, from '
+        '0 (default: nearest)',
     )
     parser.add_argument(
         '--keypoints-size',
         type=image_size,
         metavar='WxH',
-        help='size of the images that the keypoints were found in (default: that in their file, or '
-        'that of the images)',
+        help='size of the images in which the keypoints were found (default: the size in their '
+        'file, or the size of the frames)',
     )
     parser.add_argument(
         '--scheme',
@@ -240,7 +244,7 @@ def add_keypoint_arguments(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         '--mirror',
         action='store_true',
-        help='undo a mirrored recording, of a selfie camera: frames, keypoints, masks, sides',
+        help='undo the mirroring of a selfie camera, in frames, keypoints, masks and sides',
     )
 
 
@@ -310,7 +314,7 @@ def import_video(options: argparse.Namespace, tell: Tell) -> Imported:
 
 
 def _expected(source: FrameSource, selection: Selection) -> int | None:
-    """Number of frames to import; None if it is unknown before they are read."""
+    """Number of frames to import; None if unknown before reading."""
     if not source.claimed or selection.start > 0 or math.isfinite(selection.end):
         return None
     return -(-source.claimed // selection.every)
@@ -326,7 +330,7 @@ def _seer(
     masks: Masks | None,
     tell: Tell,
 ) -> Seer:
-    """Returns a function that finds the keypoints and the mask of a frame with a stamp."""
+    """Returns a function that maps a frame and its stamp to keypoints and mask."""
     chosen: dict[int, Keypoints] | None = None
     reading = ClipReading(options.person, options.scheme, options.keypoints_size, options.mirror)
     detector = None
@@ -356,13 +360,13 @@ def _seer(
 
 
 def _detected(detector: Detector, frame: Frame, stamp_ns: int) -> Keypoints | None:
-    """The keypoints of a frame; the detector gets the frame with square pixels."""
+    """Keypoints detected in a frame; the detector gets a copy with square pixels."""
     found = detector.detect(_with_square_pixels(frame), stamp_ns)
     return None if found is None else _in_frame(frame, found)
 
 
 def _people_in(detector: PeopleDetector, frame: Frame, stamp_ns: int) -> list[SeenPerson]:
-    """The people in a frame; the detector gets the frame with square pixels."""
+    """People detected in a frame; the detector gets a copy with square pixels."""
     return [
         one._replace(keypoints=_in_frame(frame, one.keypoints), corners=one.corners * _scale(frame))
         for one in detector.detect(_with_square_pixels(frame), stamp_ns)
@@ -370,7 +374,7 @@ def _people_in(detector: PeopleDetector, frame: Frame, stamp_ns: int) -> list[Se
 
 
 def _scale(frame: Frame) -> Array:
-    """Ratio (2,) of widths and heights in a frame to those in its image with square pixels."""
+    """Factors (2,) from coordinates in the copy with square pixels to pixels of the frame."""
     width = frame.image.shape[1]
     return np.array([width / round(width * frame.aspect), 1.0])
 
@@ -401,7 +405,7 @@ def _in_pixels_of(frame: Frame, mask: Mask) -> Mask:
 def _same_size(
     source: FrameSource, selection: Selection, mirror: bool
 ) -> Generator[Frame, None, None]:
-    """Yields the frames, mirrored on request; they share one camera_info, hence one size."""
+    """Yields the frames, mirrored on request; all must have the size of the first frame."""
     size: tuple[int, ...] | None = None
     for frame in source.frames(selection):
         if size is not None and frame.image.shape != size:
@@ -422,7 +426,7 @@ def camera_of(
     tell: Tell,
     aspect: float = 1.0,
 ) -> Camera:
-    """The camera that the options describe, for images of a size."""
+    """Camera from the command line options, for images of the given size."""
     if options.camera is not None:
         return read_camera(options.camera, size, tell)
     return camera_of_view(size, options.fov, options.vertical_fov, aspect)
@@ -436,9 +440,9 @@ def _write(
     lifts: bool,
     tell: Tell,
 ) -> Imported:
-    """Writes the frames one by one, with only one in memory.
+    """Writes the frames one by one; only one frame is in memory at a time.
 
-    With `lifts` every image gets a message with 3D positions, which may be empty.
+    If `lifts` is true, every image gets a message with 3D positions, possibly empty.
     """
     messages = RosbagsMessages()
     result, camera = Imported(), None
@@ -485,15 +489,15 @@ def _check_ends(
 ) -> None:
     """Checks that the numbers of frames, keypoints and masks agree, if all frames were read.
 
-    Keypoints and masks of frames that a truncated file has lost are not counted.
+    Keypoints and masks of frames that are missing from a truncated file are no error.
     """
     if not source.ended:
         return
     count, claimed = source.count, source.claimed
     if claimed > count:
         tell(
-            f'{source.path}: {count} of the {claimed} frames that its head announces can be read; '
-            'keypoints and masks of later frames may belong to other frames'
+            f'{source.path}: {count} of the {claimed} frames that its header announces can be '
+            'read; keypoints and masks of later frames may belong to other frames'
         )
     of_masks = -1 if masks is None else masks.last
     of_keypoints = -1 if found is None else found.last

@@ -29,9 +29,9 @@ IMAGE_SUFFIXES = ('.jpg', '.jpeg', '.png', '.bmp', '.tif', '.tiff', '.webp', '.p
 LARGEST_IMAGE_FILE = 2**28  # maximum size, bytes
 MOST = 1e9  # maximum number of frames; a larger number in the header is a sign of damage
 FASTEST = 1000.0  # maximum frames per second; a higher rate in the container is a sign of damage
-_EXIF_WITHIN = 2**16  # bytes from the start of a JPEG that are searched for Exif data
+_EXIF_WITHIN = 2**16  # number of bytes at the start of a JPEG that are searched for Exif data
 _HALF = 127  # threshold of masks, grey levels
-_SQUAREST, _THINNEST = 0.99, 0.1  # limits of the ratio of the shorter to the longer side of a pixel
+_SQUAREST, _THINNEST = 0.99, 0.1  # limits of the aspect ratio of a pixel, shorter over longer side
 # OpenCV 4.6, which Ubuntu 24.04 ships, reports the rotation of a video with the wrong sign.
 _TURNS_BACKWARDS = cv2.__version__.startswith('4.6.')
 
@@ -43,9 +43,9 @@ class Frame:
     Attributes:
         number: number of the frame in the source, from 0.
         time_ns: time since the first frame of the source, ns.
-        name: name of its file; '' in a video file.
-        image: (H, W, 3) BGR, upright.
-        jpeg: content of its file if that is a JPEG of the same upright image; else None.
+        name: name of the image file; '' in a video.
+        image: (H, W, 3) upright image, BGR.
+        jpeg: content of the image file if it is a JPEG of the same upright image; None otherwise.
         aspect: width of a pixel over its height.
     """
 
@@ -86,17 +86,17 @@ class Selection:
 
 
 class FrameSource:
-    """Frames of a file or a folder; the base class has no frames and only numbers labels.
+    """A source of frames; this base class has no frames and only maps labels to frame numbers.
 
     Args:
-        names: names of the files of the frames in order; empty for a video file.
-        first_number: number of the first frame in labels.
+        names: names of the image files in order; empty for a video file.
+        first_number: number that labels give to the first frame.
 
     Attributes:
         claimed: number of frames according to the header; 0 if unknown.
         count: number of frames read so far, wanted or not.
         ended: whether the last frame was read.
-        notes: lines for the user on mirrored frames and pixel shapes.
+        notes: lines of text for the user about mirrored frames and pixel shapes.
         rate: frames per second; None if unknown.
     """
 
@@ -125,8 +125,8 @@ class FrameSource:
         """Number, from 0, of the frame that a label refers to.
 
         Args:
-            label: name of the frame's file, with or without suffix; or a number or another name,
-                whose last number counts frames from `first_number`, as in walk_000012.
+            label: file name of the frame, with or without suffix; or a number or a name such as
+                walk_000012, whose last number is the frame number, counted from `first_number`.
 
         Raises:
             ValueError: the label refers to no frame.
@@ -150,7 +150,7 @@ def open_source(path: Path, fps: float | None, first_number: int = 0) -> FrameSo
     """Opens a video file or a folder of images.
 
     Args:
-        fps: frames per second; None: the times in the video file.
+        fps: frames per second; None uses the times in the video file.
 
     Raises:
         ValueError: the file or folder is missing or has no frames.
@@ -168,7 +168,7 @@ class VideoFile(FrameSource):
     """A video file; frames are rotated and mirrored according to its metadata, as in players.
 
     Args:
-        fps: frames per second; None: the times in the file.
+        fps: frames per second; None uses the times in the file.
     """
 
     def __init__(self, path: Path, fps: float | None, first_number: int = 0) -> None:
@@ -181,8 +181,9 @@ class VideoFile(FrameSource):
         self._matrix = display_matrix(path) or turned
         if is_mirrored(self._matrix):
             self.notes.append(
-                f'{path}: its metadata mirror the frames; they are taken as players show them, so '
-                'that left and right of the person are exchanged if the file is right without'
+                f'{path}: its metadata mirror the frames; they are imported as players show '
+                'them, so left and right of the person are exchanged if the file is correct '
+                'without mirroring'
             )
         across = self._capture.get(cv2.CAP_PROP_SAR_NUM)
         down = self._capture.get(cv2.CAP_PROP_SAR_DEN)
@@ -192,8 +193,8 @@ class VideoFile(FrameSource):
         if _THINNEST * max(across, down) < min(across, down) < _SQUAREST * max(across, down):
             self._aspect = across / down
             self.notes.append(
-                f'{path}: pixels are {self._aspect:.3g} times as wide as high: frames stay as they '
-                'are stored, and a field of view is that of the picture as players show it'
+                f'{path}: pixels are {self._aspect:.3g} times as wide as high: frames are kept '
+                'as stored, and a field of view refers to the picture that players show'
             )
         self._fps = fps
         self.rate = fps or self._capture.get(cv2.CAP_PROP_FPS) or None
@@ -216,7 +217,7 @@ class VideoFile(FrameSource):
             self._capture.release()
 
     def _times(self) -> Iterator[int]:
-        """Yields the time of each frame, which stays current until the next time is requested."""
+        """Yields the time of each frame, ns; decode the frame before requesting the next time."""
         fps = self._capture.get(cv2.CAP_PROP_FPS)
         first, last = 0.0, -1
         while self._capture.grab():
@@ -227,10 +228,10 @@ class VideoFile(FrameSource):
             if self._fps is not None:
                 time_ns = round(self.count * SECOND_NS / self._fps)
             elif time_ns <= last:
-                # Times are 0 in containers without times, and may decrease in damaged ones.
+                # Times are 0 in containers without times, and can decrease in damaged containers.
                 if not 0 < fps <= FASTEST:
                     raise ValueError(
-                        f'{self.path} has neither times nor a rate of frames; give --fps'
+                        f'{self.path} has neither timestamps nor a frame rate; give --fps'
                     )
                 time_ns = last + round(SECOND_NS / fps)
             last = time_ns
@@ -243,7 +244,7 @@ class ImageFolder(FrameSource):
     """A folder of images, in the order of the numbers in their names.
 
     Args:
-        fps: images per second; None if unknown, then only single images can be read.
+        fps: images per second; None allows only `frame`, not `frames`.
     """
 
     def __init__(self, path: Path, fps: float | None, first_number: int = 0) -> None:
@@ -257,7 +258,7 @@ class ImageFolder(FrameSource):
     def frames(self, selection: Selection) -> Iterator[Frame]:
         """See `FrameSource`."""
         if self._fps is None:
-            raise ValueError(f'{self.path} is a folder of images: give their rate by --fps')
+            raise ValueError(f'{self.path} is a folder of images: give their rate with --fps')
         step = SECOND_NS / self._fps
         times = (round(i * step) for i in range(len(self._files)))
         for number, time_ns, wanted in selection.wanted(times):
@@ -295,7 +296,7 @@ def _upright(content: bytes) -> tuple[Image, bytes | None]:
 
 
 def natural_order(name: str) -> list[tuple[int, str]]:
-    """Sort key of names by their numbers: frame_9 before frame_10."""
+    """Sort key that orders names by their numbers, frame_9 before frame_10."""
     parts = re.findall(r'\d+|\D+', name)
     return [(int(x), '') if x.isdecimal() else (-1, x) for x in parts]
 
@@ -307,7 +308,7 @@ class Masks:
     belongs to the frame of the same number.
 
     Raises:
-        ValueError: there are no masks, or file names give no frame or the same frame.
+        ValueError: no masks, a file name without a frame, or two masks of one frame.
     """
 
     def __init__(self, path: Path, source: FrameSource) -> None:
@@ -333,14 +334,14 @@ class Masks:
 
     @property
     def last(self) -> int:
-        """Number of the last frame that has a mask; -1 if missing, or in a video."""
+        """Number of the last frame that has a mask; -1 without masks, or for a video."""
         return max(self._files, default=-1)
 
     def of(self, frame: Frame) -> Mask | None:
         """The mask (H, W) of a frame, or None; call it with increasing frame numbers.
 
         Raises:
-            ValueError: its size differs from that of the frame, or it covers the whole image.
+            ValueError: mask and frame differ in size, or the mask covers the whole image.
         """
         found = self._found(frame.number)
         if found is None:
@@ -366,9 +367,9 @@ class Masks:
 
 
 def mask_in(image: Image) -> Mask:
-    """Mask (H, W) of the person in a picture (H, W, 3) of a mask.
+    """Converts the image (H, W, 3) of a mask to a boolean mask (H, W) of the person.
 
-    The person is where the brightest channel exceeds 127, or 0 in a picture of zeros and ones.
+    A pixel is True if its brightest channel exceeds 127, or 0 in an image of zeros and ones.
     """
     brightest = image.max(2)
     result: Mask = brightest > (_HALF if brightest.max() > 1 else 0)

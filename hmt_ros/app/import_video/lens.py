@@ -1,7 +1,7 @@
 """Reads the focal length from the metadata of a video file, where Apple phones write it.
 
 The key is in the metadata of the movie or of its track (QuickTime File Format, Metadata): a box
-`keys` with names, and a box `ilst` with values by the number of their name.
+`keys` with names, and a box `ilst` with a value for the number of each name.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def told_fov(path: Path) -> float | None:
 
 
 def _focal_lengths(data: Data) -> Iterator[float]:
-    """Yields the values of the key in a file."""
+    """Yields the values of `KEY` in a file."""
     whole = 0, len(data)
     of_track = boxes_at(data, *whole, b'moov', b'trak', b'meta')
     for first, last in chain(boxes_at(data, *whole, b'moov', b'meta'), of_track):

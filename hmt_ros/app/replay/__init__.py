@@ -1,1 +1,1 @@
-"""The command `replay`: bags through filter, smoother and BME, offline or through live nodes."""
+"""The command `replay`: passes bags to filter, smoother and BME, offline or as live nodes."""

@@ -3,8 +3,8 @@
 Without a subject file the track starts from the keypoints in the bag, or from the prediction of a
 trained model.
 
-Both ways pass the same messages to the same objects in the same order, and write the results in
-their order: the bags are equal, byte for byte. `hmt_ros.sessions.track_messages`,
+Offline and live replay pass the same messages to the same objects in the same order, and write the
+results in this order, so the two bags are equal, byte for byte. `hmt_ros.sessions.track_messages`,
 `smoothed_messages` and `bme_session` list the topics of a new bag.
 """
 
@@ -22,9 +22,9 @@ from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import LOG_TIMES, STAMPS, ReplayOptions
 
 EPILOG = """\
-A track starts from a subject file, which gives the joints of the person in one image. Without one
-it starts from the keypoints of a detector, if the bag has some, or else from the prediction of a
-model trained on silhouettes (--bme); neither knows the size of the person:
+A track starts from a subject file (see below), which gives the joints of the person in one image.
+Without one it starts from the keypoints of a detector, if the bag has some, or else from the
+prediction of a model trained on silhouettes (--bme); neither gives the size of the person.
 
   stamp_ns: 1700000000000000000          # stamp of that image
   sigma_px: 3.0                          # standard deviation of a click
@@ -40,11 +40,11 @@ IN if it has one. Their names are absolute, /pose_mixture or, with --namespace /
 /humans/bodies/anna/pose_mixture. OUT is written completely or not at all.
 
 Several bags, or a folder with bags at any depth, go into the folder OUT, each under its own name,
-with <name>.replay.json beside it, which records what it was made from. A bag that exists already,
-made from the same input with the same parameters, is skipped; an unfinished one is replayed again.
+with <name>.replay.json beside it, which records its input and parameters. A bag that exists and was
+made from the same input with the same parameters is skipped; an unfinished one is replayed again.
 {bag} in --subject, --background, --bme and --body stands for the folder of each bag. With
---scheduler the bags go through Dask (the Python package distributed), whose workers must see the
-files under the same names; the new bags are the same, byte for byte.
+--scheduler Dask (the Python package distributed) replays the bags; its workers must see the files
+under the same names; the new bags are the same, byte for byte.
 
 examples:
   replay bags/reach -o out --subject bags/reach/subject.yaml --background bags/reach/background.png
@@ -58,7 +58,7 @@ exit code: 0 done, 1 bad input (one line on stderr explains it) or some of sever
 line for each), 130 interrupted
 """
 
-# Help texts of the options of topics: their contents and default names.
+# Help texts of the topic options: content and default name of each topic.
 _TOPICS = {
     'image': 'the images (default: image/compressed, else image, else the only topic of images)',
     'camera-info': 'the calibration (default: camera_info beside the images, else the only one)',
@@ -101,13 +101,13 @@ def _parser() -> CommandParser:
     parser.add_argument(
         '--keep-going',
         action='store_true',
-        help='skip unusable messages, with a warning for the first of each kind of fault, and read '
-        'a damaged bag up to its damage (default: stop there)',
+        help='skip unusable messages, with a warning for the first of each kind of fault, and '
+        'read a damaged bag up to its damage (default: stop with an error)',
     )
     parser.add_argument(
         '--people',
         action='store_true',
-        help='track several people, found by the detections in the bag, each into topics '
+        help='track several people from the detections in the bag, each on topics '
         'humans/bodies/<id>/...; without smoother and BME',
     )
     parser.add_argument(
@@ -124,9 +124,9 @@ def _parser() -> CommandParser:
         nargs='?',
         const='',
         metavar='MODEL',
-        help='also predict poses with a trained model and use them (always without --subject and '
-        'keypoints); '
-        'without MODEL use the small model that comes with the package',
+        help='also predict poses with a trained model and use them (always if neither --subject '
+        'nor keypoints are given); without MODEL use the small model shipped with the '
+        'package',
     )
     person.add_argument(
         '--background',
@@ -169,7 +169,7 @@ def _parser() -> CommandParser:
         '--times',
         choices=(STAMPS, LOG_TIMES),
         default=STAMPS,
-        help='times of the images: their stamps, or log: when they were recorded, where stamps are '
+        help='times of the images: their stamps, or log: their recording times, if stamps are '
         'missing or wrong (default: stamps)',
     )
     topics.add_argument(

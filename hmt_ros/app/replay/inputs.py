@@ -29,15 +29,15 @@ from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
 CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
 
-# Preferred names of the topic of the images.
+# Preferred names of the image topic.
 _USUAL = ('image/compressed', 'image')
 GROUND_TRUTH = 'ground_truth'
 # Inputs read from the bag; replay recomputes predictions.
 RECORDED = (*(row for row in INPUTS if row is not PREDICTION_INPUT), DETECTIONS_INPUT)
-# Fixed frames with z up [REP 105], and maximum number of messages that are searched for one.
+# Fixed frames with z up [REP 105], and maximum number of messages searched for such a frame.
 UPRIGHT_FRAMES = ('odom', 'map', 'world')
 _SEARCHED = 2000
-# Suffix of the topic of the filter's drawings.
+# Suffix of the topic with the filter's overlay images.
 OVERLAY = 'overlay/compressed'
 
 
@@ -47,13 +47,13 @@ class RecordedInput:
 
     Attributes:
         given: topics of the additional inputs, by source.
-        transforms: topics of the transforms in the bag by source, keys in `TRANSFORMS`; None if
+        transforms: topics of the transforms in the bag, by source in `TRANSFORMS`; None if
             transforms are not used.
-        upright_frame: one of `UPRIGHT_FRAMES` that is an ancestor of the camera frame; empty if
-            there is none.
+        upright_frame: ancestor of the camera frame that is one of `UPRIGHT_FRAMES`; empty if
+            missing.
         video: whether the images are packets of a video, which `messages` decodes.
-        scaled: size (width, height), px, of the images, to which `messages` scales a calibration
-            of another size with the same aspect ratio; None if the calibration fits.
+        scaled: image size (width, height), px, to which `messages` scales the calibration; None
+            if the calibration needs no scaling.
         by_log: whether `messages` replaces stamps by the log times of the images.
     """
 
@@ -74,15 +74,15 @@ class RecordedInput:
         return 'compressed' if compressed else 'raw'
 
     def of(self, name: str) -> Topic | None:
-        """Topic of an input of `RECORDED`, by its name; None if the bag has none."""
+        """Topic of the input with this name in `RECORDED`; None if the bag lacks it."""
         row = next(row for row in RECORDED if row.name == name)
         return next((self.given[source] for source in row.types if source in self.given), None)
 
     def messages(self, bag: BagReader) -> Generator[tuple[str, BagMessage], None, None]:
-        """Yields (source, message) by log time; the source is one of the filter or `GROUND_TRUTH`.
+        """Yields (source, message) by log time; a source is a filter input or `GROUND_TRUTH`.
 
         Raises:
-            BagError: the bag is damaged here; the messages before the damage were yielded.
+            BagError: the bag is damaged; raised after the messages before the damage.
         """
         sources = {self.image.name: IMAGE, self.camera_info.name: CAMERA_INFO}
         if self.ground_truth is not None:
@@ -109,22 +109,22 @@ class RecordedInput:
         if not self.by_log and len(first) == 2 and not any(map(image_stamp, first)):
             raise BagError(
                 f'{bag.path}: the images on {self.image.name} have no stamps (all are 0): '
-                '--times log takes the times at which they were recorded'
+                '--times log uses the times at which they were recorded'
             )
 
 
 def _scaled(stored: BagMessage, size: tuple[int, int]) -> BagMessage:
-    """The camera_info, scaled to images of another size."""
+    """Scales a camera_info message to images of another size."""
     try:
         camera, header = camera_from_info(stored.message, size), stored.message.header
     except ValueError:
-        return stored  # the node that receives it reports the fault
+        return stored  # the node that receives the message reports the fault
     stamp, frame = time_ns(header.stamp), str(header.frame_id)
     return stored.with_message(camera_info_message(RosbagsMessages(), camera, stamp, frame))
 
 
 def fitted(bag: BagReader, recorded: RecordedInput, tell: Callable[[str], object]) -> RecordedInput:
-    """The same topics, with the calibration scaled if the images have another size."""
+    """Returns the input, with `scaled` set if images and calibration differ in size."""
     messages = bag.messages([recorded.image.name])
     if recorded.video:
         messages = with_pictures(messages, recorded.image.name)
@@ -145,15 +145,15 @@ def fitted(bag: BagReader, recorded: RecordedInput, tell: Callable[[str], object
 def _by_log(messages: Iterator[BagMessage], image: str) -> Iterator[BagMessage]:
     """Replaces the stamp of each image by its log time.
 
-    Any other message gets the log time of the newest image with its old stamp, or else its own.
-    Transforms get their own log times.
+    Any other message gets the log time of the newest image that had the same stamp, or else its own
+    log time. Transforms get their own log times.
     """
     times: dict[int, int] = {}
     for stored in messages:
         try:
             message = stored.message
         except BagError:
-            message = None  # the node that receives it reports the fault
+            message = None  # the node that receives the message reports the fault
         for each in getattr(message, 'transforms', [message]):
             if (header := getattr(each, 'header', None)) is None:
                 continue
@@ -176,13 +176,13 @@ def recorded_input(
 ) -> RecordedInput:
     """Finds the topics that a replay reads.
 
-    Images are on `image/compressed`, else on `image`, else on the only topic of images. The
-    calibration is on `camera_info` beside the images, else on the only topic of its type.
+    Images are on `image/compressed`, else on `image`, else on the only image topic. The calibration
+    is on `camera_info` in the namespace of the images, else on the only topic of its type.
     Additional inputs have the names in the table of inputs; transforms are on `/tf` and
     `/tf_static`.
 
     Args:
-        image_topic, camera_info_topic: names that replace the automatic choice.
+        image_topic, camera_info_topic: topic names that replace the automatic choice.
         topics: topics that replace the automatic choice, by the name of the input.
         namespace: preferred namespace of the topics, '/humans/bodies/p1' for example.
 
@@ -276,8 +276,8 @@ def _camera_info_topic(bag: BagReader, image: Topic, name: str | None) -> Topic:
         return beside
     if not bag.topics_of(*kinds):
         raise BagError(
-            f'{bag.path} has images on {image.name}, but no camera_info: without the calibration '
-            'of the camera images do not determine positions in space'
+            f'{bag.path} has images on {image.name}, but no camera_info: without a calibration, '
+            'images do not determine positions in space'
         )
     return _the_only(bag, kinds, '--camera-info-topic')
 
@@ -285,7 +285,7 @@ def _camera_info_topic(bag: BagReader, image: Topic, name: str | None) -> Topic:
 def _in_namespace(
     bag: BagReader, namespace: str, name: str, kinds: tuple[str, ...]
 ) -> Topic | None:
-    """The topic of one of the types with a name in a namespace, else in the root."""
+    """The topic with a name and one of the types, in the namespace or else in the root."""
     inside = absolute_name(name, namespace).lstrip('/')
     return _named(bag, inside, kinds) or _named(bag, name, kinds)
 
@@ -299,7 +299,7 @@ def _named(bag: BagReader, name: str, kinds: tuple[str, ...]) -> Topic | None:
 def _the_only(
     bag: BagReader, kinds: tuple[str, ...], option: str, besides: tuple[str, ...] = ()
 ) -> Topic:
-    """The only topic of some types, except for given names and the drawings of the tracker."""
+    """The only topic of the given types, apart from `besides` and the filter's overlay images."""
     found = [
         topic
         for topic in bag.topics_of(*kinds)

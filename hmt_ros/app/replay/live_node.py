@@ -1,9 +1,9 @@
-"""Real nodes in processes of their own, fed over DDS in lock step.
+"""Runs real nodes in separate processes and sends them messages over DDS in lock step.
 
 Each message is published unchanged. The next message is published after the node has reported on
 `~/handled` how it handled the message, and after all its results have arrived. No message is lost
-or reordered, so the result does not depend on the speed of the machine. The nodes run in the domain
-of their player, which no other process uses.
+or reordered, so the result does not depend on the speed of the machine. The nodes run in the DDS
+domain of their player; no other process uses this domain.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from hmt_ros.sessions.session import SUBSCRIBERS, PublishedTopic
 from hmt_ros.sessions.transform_buffer import TF_STATIC
 from msg_tools.messages.cdr import canonical, deserialise, serialise
 
-# Long time limits, which end a replay that hangs; a node that ends is detected at once.
+# Time limits, s. Only a replay that hangs reaches them; a node that exits is noticed at once.
 START_SECONDS = 600.0
 MESSAGE_SECONDS = 120.0
 STOP_SECONDS = 20.0
 STALE_SECONDS = 3600.0
-# Sources whose messages late subscribers also get.
+# Sources with transient local QoS, so that late subscribers also get their messages.
 LATCHED_SOURCES = (TF_STATIC,)
 
 
@@ -43,7 +43,7 @@ class NodeProcess:
 
     Args:
         player: the participant that the nodes communicate with.
-        words: arguments of its command line, before those of ROS.
+        words: arguments of the command line, before the ROS arguments.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class NodeProcess:
         """Starts the process."""
         sources = str(Path(hmt_ros.__file__).resolve().parents[1])
         command = [sys.executable, '-m', self._module, *self._words, '--ros-args', *self._options]
-        # Without status lines the last line of the output explains a failure.
+        # No status lines, so that the last line of the output explains a failure.
         command += ['--log-level', 'warn']
         with self._file.open('wb') as output:
             self._process = subprocess.Popen(
@@ -78,10 +78,10 @@ class NodeProcess:
                         [sources, *filter(None, [os.environ.get('PYTHONPATH')])]
                     ),
                     'ROS_LOG_DIR': str(self._player.folder),
-                    # See `hmt_ros.nodes.run_node.OWNER`: the nodes of a killed replay end.
+                    # The nodes exit if the replay is killed, see `hmt_ros.nodes.run_node.OWNER`.
                     'HMT_ROS_OWNER': str(os.getpid()),
                 },
-                # The interrupt key must reach this process only, which then stops the node.
+                # The interrupt key must reach only this process, which then stops the node.
                 start_new_session=True,
             )
 
@@ -119,10 +119,10 @@ class LiveNode:
     Args:
         player: the participant that publishes for the node and subscribes to it.
         inputs: topic and type of the messages for the node, by source.
-        sensors: topics with the QoS of sensor data, which may lose messages; they are made
-            reliable here.
-        module: module that runs the node; empty: the module of its name in `hmt_ros.nodes`.
-        within: a process of several nodes, which the caller starts; None: a process of its own.
+        sensors: topics with sensor data QoS, which may lose messages; the QoS is overridden to
+            reliable.
+        module: module that runs the node; empty selects `hmt_ros.nodes.<name>`.
+        within: shared process of several nodes, which the caller starts; None starts a new process.
         write: called with topic, stamp and bytes of each message of the node, in order.
 
     Raises:
@@ -160,7 +160,7 @@ class LiveNode:
         self.publish_bytes(source, serialise(message))
 
     def publish_bytes(self, source: str, data: bytes) -> None:
-        """Publishes bytes for the node, which need not be a valid message."""
+        """Publishes bytes for the node; they need not be a valid message."""
         if source in self._shared:
             self._own.sent(data)
         self._publishers[source].publish(data)
@@ -174,7 +174,7 @@ class LiveNode:
         """Waits until the next message is handled, and writes the results of the node.
 
         Args:
-            seconds: maximum time to wait; None: `MESSAGE_SECONDS`.
+            seconds: maximum time to wait; None selects `MESSAGE_SECONDS`.
 
         Raises:
             LiveNodeError: the node has ended, or does not answer.
@@ -184,7 +184,7 @@ class LiveNode:
         handled = handled_of(deserialise(answer, HANDLED))
         for topic, stamp in handled.published:
             if topic not in self._arrived:
-                continue  # a topic of one person, which is created and closed during the run
+                continue  # topic of a single person, created and closed during the run
             data = self._next(self._arrived[topic], patience, f'{topic} of {stamp} ns')
             # DDS may pad a message to a multiple of four bytes.
             self._write(topic, stamp, canonical(data, self._topics[topic].msgtype))
@@ -229,14 +229,14 @@ class LiveNode:
 
     @property
     def title(self) -> str:
-        """Name of the node in messages."""
+        """Name of the node for error messages."""
         return self.name.replace('_', ' ')
 
     def wait_until_active(self) -> None:
         """Returns when the node is active and subscribes to all its inputs.
 
         Raises:
-            LiveNodeError: it does not become active.
+            LiveNodeError: the node does not become active.
         """
         self._wait(self._state.service_is_ready, START_SECONDS, 'the node')
         label = ''
@@ -247,7 +247,7 @@ class LiveNode:
             future = self._state.call_async(self._state_request)
             self._wait(future.done, START_SECONDS, 'the state of the node')
             label = future.result().current_state.label
-        # The player subscribes to shared topics as well.
+        # Shared topics have one more subscriber, the player.
         publishers = self._publishers.items()
         self._wait(
             lambda: all(
@@ -259,10 +259,10 @@ class LiveNode:
         )
 
     def wait_until_heard(self, sources: tuple[str, ...], count: int) -> None:
-        """Returns when a number of nodes, including this one, subscribe to some of its inputs.
+        """Waits until `count` nodes, including this one, subscribe to the given sources.
 
         Raises:
-            LiveNodeError: they do not subscribe in time.
+            LiveNodeError: the nodes do not subscribe in time.
         """
         publishers = [self._publishers[source] for source in sources]
         self._wait(
@@ -272,13 +272,13 @@ class LiveNode:
         )
 
     def wait_for_subscribers(self, topics: tuple[str, ...], count: int) -> None:
-        """Returns when a number of subscribers, including this player, are connected to topics.
+        """Waits until each topic has `count` connected subscribers, including this player.
 
-        The node itself reports the number in its diagnostics; the graph may list subscribers that
-        are not connected yet.
+        The number is from the diagnostics of the node, because the ROS graph may list subscribers
+        that are not connected yet.
 
         Raises:
-            LiveNodeError: they are not connected in time.
+            LiveNodeError: the subscribers are not connected in time.
         """
 
         def connected() -> bool:
@@ -305,7 +305,7 @@ class LiveNode:
         """ROS options with the parameters of the node and the names of its topics."""
         values = {name: yaml_scalar(value) for name, value in values_of(parameters).items()}
         if 'stale_time' in values:
-            # In lock step the time that an image takes has no limit.
+            # In lock step the processing time of an image has no limit.
             values['stale_time'] = yaml_scalar(STALE_SECONDS)
         for topic in sensors:
             values[f'qos_overrides.{topic}.subscription.reliability'] = 'reliable'
@@ -320,7 +320,7 @@ class LiveNode:
         return options
 
     def _topic(self, name: str) -> str:
-        """The absolute topic of a name; absolute topics that the node publishes get its prefix."""
+        """Absolute topic name; absolute topics that the node publishes get its name as prefix."""
         if not name.startswith('/'):
             return f'/{name}'
         return f'/{self.name}{name}' if name in self._topics else name
@@ -337,7 +337,7 @@ class LiveNode:
             )
             for source, (topic, msgtype) in inputs.items()
         }
-        # Sources on topics that the node also publishes, and own messages on these topics.
+        # Sources on topics that the node also publishes, and the player's own messages on them.
         self._shared = {source for source, (topic, _) in inputs.items() if topic in self._topics}
         self._own = OwnMessages()
         shared = {inputs[source][0] for source in self._shared}
@@ -356,7 +356,7 @@ class LiveNode:
             player.reliable,
             raw=True,
         )
-        # Created last: discovery announces the topics above to the node before this client.
+        # Created last, so that discovery announces the topics above before this client.
         self._state = node.create_client(GetState, f'/{self.name}/get_state')
         self._state_request = GetState.Request()
 
@@ -386,7 +386,7 @@ class LiveNode:
 
 
 def _into(queue: deque[bytes], own: OwnMessages | None = None) -> Callable[[bytes], None]:
-    """A callback that queues messages except own ones; rclpy inspects its signature."""
+    """Returns a callback that queues messages except own ones; rclpy needs its signature."""
 
     def receive(data: bytes) -> None:
         if own is None or not own.is_own(data):

@@ -34,7 +34,7 @@ from msg_tools.files.error_line import LONGEST_LINE, error_line, one_line
 from msg_tools.files.new_folder import locked, new_file
 from msg_tools.files.plain_json import read_plain_json
 
-# Options that affect the new bag, besides the parameters.
+# Options other than parameters that affect the new bag.
 _DECIDING = (
     'image_topic',
     'camera_info_topic',
@@ -56,9 +56,9 @@ _PATIENCE = 10.0  # maximum time until a scheduler answers, s
 
 
 class Job(NamedTuple):
-    """The replay of one of many bags: name of the new bag in its folder, paths, options.
+    """The replay of one of many bags; `name` is the new bag's path in the output folder.
 
-    `shows` is true if the progress of this bag is shown besides the total progress.
+    `shows` is true if the progress of this bag is shown in addition to the total progress.
     """
 
     name: str
@@ -110,7 +110,7 @@ def replay_many(
         The exit code: 0 if all bags are done, 1 if some failed, or `INTERRUPTED`.
 
     Raises:
-        ValueError: no replay can be started.
+        ValueError: the replay can not be started.
     """
     if options.live:
         raise ValueError('--live replays one bag at a time; leave it out for several')
@@ -134,7 +134,7 @@ def replay_many(
                 bar.update()
     except KeyboardInterrupt:
         done = counts[DONE] + counts[BEFORE]
-        tell(f'interrupted, {done} of {len(jobs)} bags are done; the same command continues')
+        tell(f'interrupted, {done} of {len(jobs)} bags are done; the same command resumes')
         return INTERRUPTED
     if not options.quiet:
         say(
@@ -188,8 +188,8 @@ def _replay_in_worker(job: Job) -> Outcome:
 def _keep_memory() -> None:
     """Makes the C library keep the memory of an image for the next image.
 
-    In the environment of Dask workers it returns all memory at once, and workers spend more than a
-    quarter of their time on pages that the system fills with zeros.
+    In Dask workers the library would return freed memory at once; the workers would then spend more
+    than a quarter of their time on new pages, which the system fills with zeros.
     """
     mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)  # only glibc has it
     if mallopt is not None:
@@ -222,7 +222,7 @@ def _replayed_once(job: Job, tell: Tell) -> tuple[str, str]:
     if known.get('made_from') == made_from:
         if known.get('done') and known.get('files') == _sizes(target):
             return BEFORE, 'done before'
-        # An earlier run of this command did not complete the bag; its remains may be replaced.
+        # An earlier run of this command left the bag incomplete; it can be overwritten.
         options = replace(options, overwrite=True)
     elif os.path.lexists(target) and not options.overwrite:
         raise BagError(
@@ -271,7 +271,7 @@ def _made_from(job: Job) -> dict[str, Any]:
 
 
 def _without_paths(value: Any) -> Any:
-    """The value with names of files replaced by their checksums."""
+    """The value with file names replaced by checksums of the files."""
     if isinstance(value, dict):
         return {key: _without_paths(entry) for key, entry in value.items()}
     if isinstance(value, str) and value and len(value) < 4096 and Path(value).is_file():
@@ -308,7 +308,7 @@ def _jobs(
     for path in sources:
         several = path.is_dir() and not (path / FILE_NAME).exists()
         if several and path.resolve() == output.resolve():
-            raise ValueError(f'{path} is the folder that is read; give another name')
+            raise ValueError(f'{path} is the input folder; give another name')
         bags = dict(_bags_in(path, output)) if several else {_name(path): path}
         if not bags:
             raise BagError(f'{path} has no bags in it')

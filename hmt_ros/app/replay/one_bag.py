@@ -1,4 +1,4 @@
-"""Replay of one bag into a new one."""
+"""Replays one bag into a new bag."""
 
 from __future__ import annotations
 
@@ -58,16 +58,16 @@ class Replayed:
 def replay_bag(
     source: Path, target: Path, options: ReplayOptions, tell: Tell, *, shows: bool | None = None
 ) -> Replayed:
-    """Replays a bag into a new one, which is written completely or not at all.
+    """Replays a bag into a new bag, which is written completely or not at all.
 
     Args:
-        shows: whether progress is shown; None: shown unless `options.quiet`.
+        shows: whether progress is shown; None shows it unless `options.quiet`.
 
     Raises:
         ValueError: bad input.
     """
     if target.exists() and target.resolve() in (source.resolve(), source.resolve().parent):
-        raise ValueError(f'{target} is the bag that is read; give another name')
+        raise ValueError(f'{target} is the input bag; give another name')
     with BagReader(source) as bag:
         recorded = options.recorded(bag)
         recorded.check_stamps(bag)
@@ -93,7 +93,7 @@ def replay_bag(
             if recorded.transforms and TF_STATIC in recorded.transforms:
                 topic = absolute_name(recorded.transforms[TF_STATIC].name)
                 out.add_topic(topic, TRANSFORMS_TYPE, latched=True)
-            # Writing and decoding run in threads of their own while an image is tracked.
+            # Writing and decoding run in separate threads while an image is tracked.
             hidden = options.quiet if shows is None else not shows
             with (
                 WriteBehind() as behind,
@@ -135,7 +135,7 @@ def _subject_hint(bag: Path) -> str:
 
 
 def _used(recorded: RecordedInput, parameters: NodeParameters) -> RecordedInput:
-    """The topics that at least one node uses."""
+    """The recorded input with only the topics that some node uses."""
     tracking, bme = parameters.filter, parameters.bme
     rows = session_of(tracking).inputs_of(tracking)
     used = [row for row in rows if row.is_used(tracking)]
@@ -169,7 +169,7 @@ def _play(
 
     def check(handled: Handled) -> None:
         behind.check()
-        # A pose_mixture may be empty, and several people may be tracked in one image.
+        # Count stamps, not messages: several people may be tracked in one image.
         result.tracked += len(
             {stamp for topic, stamp in handled.published if topic.endswith('human_joint_states')}
         )
@@ -186,7 +186,7 @@ def _play(
     with ReadAhead(partial(_read, messages, not options.live), messages.close) as ahead:
         for source, stored, given in _readable(ahead, options.keep_going, tell):
             if source in copied:
-                # Inputs keep their names in spite of the namespace of the results.
+                # Inputs keep their names; the namespace applies only to results.
                 topic = absolute_name(stored.topic)
                 behind.call(out.write, topic, stored.log_time_ns, stored.message)
             if source == GROUND_TRUTH:
@@ -201,10 +201,12 @@ def _play(
 
 
 def _read(messages: Iterator[tuple[str, BagMessage]], decode: bool) -> tuple[str, BagMessage, Any]:
-    """Source, message and form for the nodes of the next message; images may be decoded.
+    """Returns the source of the next message, the stored message, and the form for the nodes.
+
+    With `decode`, compressed images are decoded for the nodes.
 
     Raises:
-        BagError: its bytes are not a message; the next message can still be read.
+        BagError: the bytes are not a valid message; the next message can still be read.
         StopIteration: there is no further message.
     """
     source, stored = next(messages)
@@ -213,7 +215,7 @@ def _read(messages: Iterator[tuple[str, BagMessage]], decode: bool) -> tuple[str
         try:
             picture = decode_image(given)
         except ImageError:
-            # The node that receives it reports the fault.
+            # The node that receives the image reports the fault.
             return source, stored, given
         given = image_message(
             RosbagsMessages(), picture, time_ns(given.header.stamp), str(given.header.frame_id)
@@ -224,7 +226,7 @@ def _read(messages: Iterator[tuple[str, BagMessage]], decode: bool) -> tuple[str
 def _readable(
     messages: Iterator[tuple[str, BagMessage, Any]], keep_going: bool, tell: Tell
 ) -> Iterator[tuple[str, BagMessage, Any]]:
-    """Yields the messages that can be read, up to a damaged place.
+    """Yields the messages that can be read.
 
     Raises:
         BagError: a message can not be read, and `keep_going` is false.
@@ -250,8 +252,8 @@ def _why_nothing(result: Replayed, subject: object, detected: bool) -> str:
         )
     if subject is None and not result.last_fault:
         remedy = (
-            ': give an image of the empty scene by --background FILE, the joints of the person in '
-            'one image by --subject FILE, or a bag with keypoints'
+            ': give an image of the empty scene with --background FILE, the joints of the '
+            'person in one image with --subject FILE, or a bag with keypoints'
         )
         return f'nobody is found in its {result.images} images{"" if detected else remedy}'
     why = f': {result.last_fault}' if result.last_fault else ''
@@ -259,7 +261,7 @@ def _why_nothing(result: Replayed, subject: object, detected: bool) -> str:
 
 
 class ReadAhead(AbstractContextManager['ReadAhead[Item]'], Generic[Item]):
-    """An iterator that makes its next item while the current one is in use.
+    """An iterator that prepares its next item in a thread while the current item is in use.
 
     Iteration can continue after an error. The context manager ends the thread.
 
@@ -289,11 +291,11 @@ class ReadAhead(AbstractContextManager['ReadAhead[Item]'], Generic[Item]):
 
 
 class WriteBehind(AbstractContextManager['WriteBehind']):
-    """Makes calls in order in a thread, while the caller continues.
+    """Runs queued calls in order in a thread, while the caller continues.
 
-    The context manager waits for all calls at its end, or drops them on an error. `check` and the
-    end of the context raise the error of a call; later calls are not made. `call` itself raises
-    nothing, so that its caller does not mistake such an error for its own.
+    The end of the context waits for all calls, or drops them after an error. It raises the error of
+    a failed call, as `check` does; later calls are skipped. `call` itself does not raise it, so
+    that the caller does not mistake it for its own error.
     """
 
     def __init__(self) -> None:
@@ -307,7 +309,7 @@ class WriteBehind(AbstractContextManager['WriteBehind']):
             self.check()
 
     def call(self, function: Callable[..., None], *arguments: Any) -> None:
-        """Queues a call, which is made after all earlier calls."""
+        """Queues a call, which runs after all earlier calls."""
         while self._waiting and (len(self._waiting) >= _MOST_WAITING or self._waiting[0].done()):
             self._waiting.popleft().result()
         self._waiting.append(self._thread.submit(self._make, function, arguments))

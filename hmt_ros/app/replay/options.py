@@ -30,19 +30,19 @@ FILTER, SMOOTHER, BME = 'filter_node', 'smoother_node', 'bme_node'
 PEOPLE_NODE = 'people_node'
 # Choices of image times: stamps or log times.
 STAMPS, LOG_TIMES = 'stamps', 'log'
-# Prefixes of the parameters of each node in --set.
+# Prefix of parameters in --set, by node.
 _PREFIXES = {SMOOTHER: 'smoother.', BME: 'bme.', FILTER: ''}
-# Parameters that replay decides itself; those in a parameter file are ignored.
+# Parameters that replay sets itself; their values in a parameter file are ignored.
 _DECIDED_HERE = ('image_transport', 'autostart')
 # Prefixes of parameters that ROS declares for every node.
 _OF_ROS = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
-# Placeholder for the folder of a bag in options that name files of one person.
+# Placeholder for the folder of the bag, in options that name a file.
 _BAG = '{bag}'
 
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """Arguments of the command except its bags; see its help.
+    """Arguments of the command `replay` except the bags; see its help.
 
     `with_smoother` is false for --no-smoother, `settings` are the values of --set, and an empty
     `bme` selects the model that ships with the package.
@@ -105,7 +105,7 @@ class ReplayOptions:
         return replace(self._renamed(absolute), config=config)
 
     def _renamed(self, rename: Callable[[str], str]) -> ReplayOptions:
-        """The options with changed names of the files of a person."""
+        """The options with `rename` applied to all file names except those of --config."""
 
         def path(value: Path | None) -> Path | None:
             return None if value is None else Path(rename(str(value)))
@@ -178,7 +178,7 @@ def _filter_parameters(options: ReplayOptions, recorded: RecordedInput) -> Filte
 
 
 def _tracking_values(options: ReplayOptions, recorded: RecordedInput, node: str) -> dict[str, Any]:
-    """Values for a tracking node, which uses all inputs and transforms in the bag.
+    """Parameter values of a tracking node that uses all inputs and transforms in the bag.
 
     Values given by the user take precedence.
     """
@@ -252,7 +252,7 @@ def _given_values(options: ReplayOptions, node: str) -> dict[str, Any]:
     """Values from --config and --set for a node, by name."""
     values: dict[str, Any] = {}
     for file in options.config:
-        # Sections for all nodes apply to the filter only: many names differ in meaning elsewhere.
+        # Sections for all nodes apply only to the tracking node; others use names differently.
         read = read_parameter_file(file, node, by_name=node not in (FILTER, PEOPLE_NODE))
         values.update(
             (name, value)
@@ -265,7 +265,7 @@ def _given_values(options: ReplayOptions, node: str) -> dict[str, Any]:
         name = name.removeprefix(_PREFIXES[owner])
         owner = PEOPLE_NODE if owner == FILTER and options.people else owner
         if not equals or name in _DECIDED_HERE:
-            why = f'{name} is decided by replay' if equals else 'wanted NAME=VALUE'
+            why = f'{name} is set by replay itself' if equals else 'wanted NAME=VALUE'
             raise ValueError(f'--set {text}: {why}')
         if owner != node:
             continue

@@ -1,4 +1,4 @@
-"""The player, a ROS node that sends messages to the real nodes, in a domain of its own."""
+"""The player, a ROS node that sends messages to the real nodes, in a separate DDS domain."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class LiveNodeError(ValueError):
 
 
 class Player:
-    """A ROS node in a domain of its own that publishes for other nodes and subscribes to them.
+    """A ROS node that publishes for other nodes and subscribes to them, in a separate domain.
 
     Raises:
         LiveNodeError: ROS is not available.
@@ -116,5 +116,5 @@ def reserved_domain() -> Iterator[int]:
 
 
 def environment(domain: int) -> dict[str, str]:
-    """Environment variables of a process in a domain that is limited to this machine."""
+    """Environment variables that put a process into a domain, limited to this machine."""
     return {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}

@@ -1,9 +1,9 @@
 """BME, filter and smoother process the messages of a bag, offline or as real nodes.
 
 The BME gets each image before the filter, which also gets the `pose_prediction` of the BME. The
-smoother gets the `likelihood_mixture` of the filter; the BME gets its `pose_mixture` if it predicts
-less often while the person is tracked. Then the next message is processed. At the end of the bag
-they finish in the same order; no message announces the end, so nodes are deactivated.
+smoother gets the `likelihood_mixture` of the filter; the BME gets the filter's `pose_mixture` if it
+predicts less often while the person is tracked. Then the next message is processed. At the end of
+the bag they finish in the same order. No message announces the end, so real nodes are deactivated.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ class PlayedTrack(AbstractContextManager['PlayedTrack'], ABC):
         self._bme: Any = None
         self._filter: Any = None
         self._smoother: Any = None
-        # Sources in the bag that the BME gets.
+        # Sources in the bag that are passed to the BME.
         self._seen: tuple[str, ...] = ()
-        # Topics of the filter that BME and smoother get, as sources of the same names.
+        # Filter topics passed to the BME, and to the smoother, as sources of the same names.
         self._heard: tuple[str, ...] = ()
         self._smoothed = () if parameters.smoother is None else (MIXTURE,)
         if (bme := parameters.bme) is not None:
@@ -63,7 +63,7 @@ class PlayedTrack(AbstractContextManager['PlayedTrack'], ABC):
 
     @abstractmethod
     def _handled(self, node: Any, source: str, message: Any = None) -> Handled:
-        """Passes a message to a node; None: the oldest waiting one from another node."""
+        """Passes a message to a node; None passes the oldest queued message of the source."""
 
     @abstractmethod
     def _finished(self, node: Any) -> Handled:
@@ -77,7 +77,7 @@ class PlayedTrack(AbstractContextManager['PlayedTrack'], ABC):
         return self._handed_on(_together(result, self._handled(self._filter, source, message)))
 
     def finish(self) -> Handled:
-        """Ends the bag and returns when all remaining results are written."""
+        """Finishes all nodes and returns when their remaining results are written."""
         result = None
         if self._bme is not None:
             result = self._predicted(self._finished(self._bme))
@@ -113,7 +113,7 @@ class OfflineTrack(PlayedTrack):
 
     def __init__(self, parameters: NodeParameters, write: Write) -> None:
         super().__init__(parameters, write)
-        # Messages from one node for another, by topic.
+        # Queued messages from one node to another, by topic.
         self._messages: defaultdict[str, deque[Any]] = defaultdict(deque)
         if parameters.bme is not None:
             self._bme = BmeSession(parameters.bme, self._publish, bme_session.TOPICS.__contains__)
@@ -144,7 +144,7 @@ class OfflineTrack(PlayedTrack):
 
 
 class LiveTrack(PlayedTrack):
-    """The real nodes, over DDS in lock step.
+    """A track with the real nodes, over DDS in lock step.
 
     Args:
         together: whether the nodes run in one process.
@@ -178,7 +178,7 @@ class LiveTrack(PlayedTrack):
                 names = [name for name, own in every if own is not None]
                 process = NodeProcess(player, opened, PERSON, f'hmt_ros.nodes.{PERSON}', names)
             live = partial(LiveNode, player, opened, within=process, write=self._write)
-            # Topics that filter and BME share; none of their messages may be lost.
+            # Topics that filter and BME share; all their messages must arrive.
             sensors = (f'/{topic}', '/camera_info', *(f'/{source}' for source in given))
             if self._parameters.bme is not None:
                 self._bme = live(
@@ -244,7 +244,7 @@ def _is_recorded(topic: str) -> bool:
 
 
 def _together(one: Handled | None, other: Handled) -> Handled:
-    """Merges the handling of a message with that of a message that resulted from it."""
+    """Merges the results for a message and for another message that resulted from it."""
     if one is None:
         return other
     return Handled(

@@ -1,4 +1,4 @@
-"""report: pictures of the mixtures in a bag, and one page with a 3D view of them for a browser."""
+"""report: draws the mixtures in a bag as pictures, and as one HTML page with a 3D view."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from msg_tools import BagReader
 from msg_tools.files.new_folder import FolderKind
 
 PAGE = 'report.html'
-# Maximum size of the page, of its data (more times are left out), and of its images at the start
-# and for each second, bytes.
+# Maximum size, bytes, of the page, of its data (further times are left out), and of its images: a
+# constant, and as much again per second.
 PAGE_BYTES = 19_500_000
 DATA_BYTES = 12_000_000
 IMAGE_BYTES = 700_000
-# Size of program and scores, which does not grow with time, bytes.
+# Size of program and scores, which is the same for any number of times, bytes.
 REST_BYTES = 200_000
 MAX_TIMES = 600
 _FOLDER = FolderKind('a report', PAGE, tuple(PICTURES))
@@ -36,13 +36,13 @@ _FOLDER = FolderKind('a report', PAGE, tuple(PICTURES))
 EPILOG = """\
 DIR gets report.html, a page that needs only a browser, neither network nor other files: images
 with the modes on them, all modes in a 3D view that turns with the mouse, a slider through time,
-weights, how far each cue of the images is believed, free energy of trajectories and, where the
-truth is known, errors and calibration. Beside it are the pictures (PNG) for documents. DIR is
-written completely or not at all.
+weights, probabilities of the image cues, free energy of trajectories and, if the truth is known,
+errors and calibration. DIR also gets the pictures (PNG) for documents. It is written completely or
+not at all.
 
 The images come from --images, else from OUT itself (replay --with-images), else from its topic
-overlay/compressed, on which the heaviest modes are already drawn. Images are scaled down to 0.7 MB
-and as much again for each second, and the page never exceeds 20 MB.
+overlay/compressed, on which the heaviest modes are already drawn. Images are scaled down to a
+total of 0.7 MB plus 0.7 MB per second, and the page never exceeds 20 MB.
 
 examples:
   report out -o report --images bags/reach
@@ -213,7 +213,7 @@ def _with_truth(mixtures: RecordedMixtures, truth: Truth) -> list[str]:
 
 
 def _shown(mixtures: RecordedMixtures, most: int) -> list[int]:
-    """Times to show: all, or every n-th if the page would get too large."""
+    """Stamps to show: all, or every n-th if there are too many for the page."""
     stamps = mixtures.stamps
     most = min(most, int(len(stamps) * min(DATA_BYTES / max(data_size(mixtures), 1), 1.0)))
     return stamps[:: -(-len(stamps) // max(most, 1))]

@@ -26,8 +26,8 @@ class Detector:
     Attributes:
         topic: name of the topic.
         joint_names: (J,) joints of the body at which the detector has landmarks.
-        joints: (J, 3) positions by stamp in ns, m, camera optical frame, shifted so that the
-            pelvis is at that of the heaviest mode; NaN where a joint was not seen.
+        joints: (J, 3) joint positions, m, camera optical frame, shifted to the pelvis of the
+            heaviest mode, by stamp in ns; NaN if a joint was not seen.
         confidences: mean confidence of all landmarks, by stamp.
     """
 
@@ -38,7 +38,7 @@ class Detector:
 
 
 def read_detector(path: Path, layer: Layer[Moment]) -> Detector | None:
-    """Reads the skeletons of the detector at the times of a layer, shifted to its pelvis.
+    """Reads the detector's skeletons at the times of a layer, shifted to the layer's pelvis.
 
     Args:
         path: path of the bag.
@@ -85,7 +85,7 @@ def _at_joints(positions: Positions, names: tuple[str, ...]) -> dict[str, Array]
 
 
 def _with_middles(joints: dict[str, Array]) -> dict[str, Array]:
-    """The joints, with pelvis and neck at the middle of hips and shoulders if these are known."""
+    """Sets pelvis and neck to the middle of the hips and of the shoulders, if these are known."""
     middles = {
         name: np.mean([joints[end] for end in ends], axis=0)
         for name, ends in _MIDDLES.items()

@@ -1,4 +1,4 @@
-"""Images of a bag as JPEGs whose total size is small enough for a page."""
+"""Images of a bag as JPEGs, with a limit on their total size for the page."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ImageSource:
     Attributes:
         bag: path of the bag.
         topic: topic of the images.
-        camera_info: topic of their calibration; None if the modes are already drawn on them.
+        camera_info: topic of the calibration; None if the modes are already drawn on the images.
     """
 
     bag: Path
@@ -70,8 +70,8 @@ def image_source(
 ) -> ImageSource | None:
     """Finds the images that belong to a bag of mixtures; returns None if missing.
 
-    The images are those in the bag `images`, else those in `out` if it has a calibration, else the
-    drawings of the tracker in `out`.
+    They are the images in the bag `images`, else the images in `out` if it has a calibration, else
+    the tracker's overlay images in `out`.
 
     Args:
         out: bag of the mixtures.
@@ -103,9 +103,9 @@ def film_strip(
     keep: Collection[int] = (),
     progress: Callable[[int], object] = lambda count: None,
 ) -> FilmStrip:
-    """Reads the images at some stamps as JPEGs.
+    """Reads the images at the given stamps as JPEGs.
 
-    Each image gets an equal part of the bytes; once one does not fit, all later images are
+    Each image gets an equal part of the bytes; once an image does not fit, all later images are
     scaled down as well.
 
     Args:
@@ -158,7 +158,7 @@ def film_strip(
 
 
 def _small(image: Image, allowed: int, level: int) -> tuple[bytes, int]:
-    """The best JPEG of an image that fits into the bytes, or else the smallest, and its level."""
+    """The best JPEG of an image within `allowed` bytes, or else the smallest, and its level."""
     while True:
         width, quality = _LEVELS[level]
         scaled = image

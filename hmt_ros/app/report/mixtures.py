@@ -1,4 +1,4 @@
-"""The mixtures in a bag as joint positions over time, which a report shows."""
+"""The mixtures in a bag as joint positions over time, for the report."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
 
 # Probabilities of the lower end, the median and the upper end of a 90 % interval.
 PROBABILITIES = np.array([0.05, 0.5, 0.95])
-# Plane through a level camera, in place of an unknown floor.
+# Horizontal plane through a level camera, used if the floor is unknown.
 _LEVEL = np.array([0.0, -1.0, 0.0, 0.0])
 _HALVINGS = 22
 # Radius of the 90 % region of a 3D normal distribution, in standard deviations.
 _RADIUS = 2.500278
 
-# Joints whose paths are drawn for trajectories, and maximum number of trajectories.
+# Joints whose paths are drawn for trajectories, and maximum number of drawn trajectories.
 ENDS = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')
 KEPT_TRAJECTORIES = 8
 # Kinds of mixtures that are shown with regions, and with heights and angles over time.
@@ -99,8 +99,8 @@ def regions_of(content: PoseMixture) -> Array:
     """Ellipsoids that contain each joint with 90 % probability, relative to the pelvis.
 
     Returns:
-        (K, J, 6) xx, yy, zz, xy, xz, yz of the matrix R, m, which maps the unit ball to the
-        ellipsoid around the joint; (K, 0, 6) if covariances are unknown.
+        (K, J, 6) entries xx, yy, zz, xy, xz, yz of the symmetric matrix, m, that maps the unit ball
+        to the ellipsoid around the joint; (K, 0, 6) if covariances are unknown.
     """
     spread = content.joint_covariances_relative
     if spread is None:
@@ -139,7 +139,7 @@ class Moment:
         joints: (K, J, 3) joint positions, camera optical frame, m.
         existence: probability that a person is in view; NaN if unknown.
         cues: probability that each image cue shows the person, by name; empty if unknown.
-        identities: (K,) identities of the modes; 0 for none.
+        identities: (K,) identities of the modes; 0 if missing.
         marginals: (2, K, J + A) heights and angles, see `marginals_of`; (2, K, 0) if unknown.
         regions: (K, J, 6) regions of the joints, see `regions_of`; (K, 0, 6) if unknown.
     """
@@ -159,12 +159,12 @@ class Window:
     """A mixture over trajectories.
 
     Attributes:
-        stamp_ns: end of the window.
+        stamp_ns: time of the end of the window.
         stamps_ns: (T,) times of the poses.
         weights: (M,) weights of all trajectories, heaviest first.
         free_energy: (I,) free energy per iteration, nats; empty if not recorded.
-        ways: (at most `KEPT_TRAJECTORIES`, T, J, 3) paths of those `ENDS` that are joints of the
-            body, m, heaviest trajectory first; None if the body is unknown.
+        ways: (at most `KEPT_TRAJECTORIES`, T, J, 3) paths of the joints in `ENDS` that the body
+            has, m, heaviest trajectory first; None if the body is unknown.
     """
 
     stamp_ns: int
@@ -198,12 +198,12 @@ class Layer(Generic[Mixture]):
     angles: tuple[str, ...] = ()
 
     def at(self, stamps: Collection[int]) -> Layer[Mixture]:
-        """The mixtures at some times only."""
+        """Copy with only the mixtures at the given stamps."""
         chosen = {stamp: one for stamp, one in self.mixtures.items() if stamp in stamps}
         return replace(self, mixtures=chosen)
 
     def spread(self, count: int) -> list[int]:
-        """A number of stamps that are spread evenly over all times."""
+        """At most `count` stamps, spread evenly over all mixtures."""
         last = len(self.mixtures) - 1
         chosen = np.unique(np.rint((np.arange(count) + 0.5) / count * last).astype(int))
         stamps = list(self.mixtures)
@@ -217,7 +217,7 @@ class RecordedMixtures:
     Attributes:
         layers: mixtures over poses, the posterior first.
         trajectories: mixtures over trajectories.
-        answered: by stamp of an image, ns, the reason why it has no pose; '' if it has one.
+        answered: reason why an image has no pose, by stamp, ns; '' if it has a pose.
     """
 
     layers: list[Layer[Moment]]
@@ -226,7 +226,7 @@ class RecordedMixtures:
 
     @property
     def stamps(self) -> list[int]:
-        """Sorted times of images, poses and ends of windows; all window times without poses."""
+        """Sorted stamps of images, poses and window ends; without poses, all stamps of windows."""
         stamps = {*self.answered, *(stamp for layer in self.layers for stamp in layer.mixtures)}
         for layer in self.trajectories:
             stamps.update(layer.mixtures)
@@ -241,7 +241,7 @@ class RecordedMixtures:
         return set(self.answered).difference(*(layer.mixtures for layer in self.layers), *windows)
 
     def at(self, stamps: Iterable[int]) -> RecordedMixtures:
-        """The mixtures at some times only, and windows that end at them, or else the last one."""
+        """Copy with only the mixtures and windows at given stamps, or else the last window."""
         wanted = set(stamps)
         layers = [layer.at(wanted) for layer in self.layers]
         return RecordedMixtures(
@@ -262,17 +262,17 @@ def read_mixtures(
     grounds: Mapping[int, GroundState] | None = None,
     progress: Callable[[int], object] = lambda count: None,
 ) -> RecordedMixtures:
-    """Reads the mixtures in a bag; the first of several with one topic and stamp counts.
+    """Reads the mixtures in a bag; the first mixture of each topic and stamp is used.
 
     Args:
         path: path of the bag.
-        topics: names of the topics to read; empty: all topics of mixtures except ground truth.
+        topics: names of the topics to read; empty selects all mixtures except ground truth.
         body_model: name or file of the body model, if the name in the bag is unknown.
-        grounds: ground by stamp, for heights.
+        grounds: ground by stamp, from which heights are computed.
         progress: called with the number of messages that were read.
 
     Raises:
-        ValueError: no mixtures, invalid messages, or several frames.
+        ValueError: no mixtures, invalid messages, or several coordinate frames.
     """
     found: dict[str, Layer[Any]] = {}
     with BagReader(path) as bag:
@@ -297,7 +297,7 @@ def read_mixtures(
         if layer.frame_id != first.frame_id:
             raise ValueError(
                 f'{path}: {layer.topic} is in the frame {layer.frame_id!r}, {first.topic} in '
-                f'{first.frame_id!r}: name those of one camera by --topic'
+                f'{first.frame_id!r}: name those of one camera with --topic'
             )
     return result
 
@@ -334,7 +334,7 @@ def _take(
 def _pose_layer(
     topic: str, bodies: RecordedBodies, grounds: Mapping[int, GroundState], message: Any
 ) -> Layer[Moment] | None:
-    """A layer of one mixture; None if nobody was seen."""
+    """A layer with the mixture of one message; None if nobody was seen."""
     content = pose_mixture_of(message)
     if not len(content.weights):
         return None
@@ -362,7 +362,7 @@ def _pose_layer(
 
 
 def _trajectory_layer(topic: str, bodies: RecordedBodies, message: Any) -> Layer[Window]:
-    """A layer of one window."""
+    """A layer with the window of one message."""
     content = trajectory_mixture_of(message)
     body = bodies.of(topic, content)
     ends = () if body is None else tuple(x for x in ENDS if x in body.joint_names)

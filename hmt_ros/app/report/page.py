@@ -37,10 +37,10 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.calibration import coverage
 from msg_tools.messages.ground import GroundState
 
-# Minimum step of positions, and step of regions, m; step of pixels, in widths of the image.
+# Quantisation steps: minimum for positions, and step for regions, m; for pixels, in image widths.
 FINEST, _REGION = 5e-4, 1e-4
 _PIXEL = 1 / 8000
-_NOWHERE = -(2**15)  # code of NaN, and of pixels of invisible points
+_NOWHERE = -(2**15)  # code of NaN and of invisible pixels
 _LARGEST = 2**15 - 1
 _SIDES = {LEFT: 'left', RIGHT: 'right'}
 _SCRIPTS = ('data.js', 'view.js', 'charts.js', 'report.js')
@@ -57,9 +57,9 @@ class Content:
         images: images at some of these times.
         truth: true joint positions; None if unknown.
         scores: scores by topic; empty without truth.
-        notes: contents that the page leaves out, and why.
+        notes: lines of text about contents that the page leaves out.
         grounds: floor and contacts by stamp; empty if unknown.
-        detector: skeletons of a detector of 3D positions; None if missing.
+        detector: skeletons from a detector of 3D keypoints; None if missing.
     """
 
     title: str
@@ -74,7 +74,7 @@ class Content:
 
 
 def data_size(mixtures: RecordedMixtures) -> int:
-    """Approximate upper bound of the size of mixtures in a page, bytes."""
+    """Approximate upper bound on the size of the mixtures in a page, bytes."""
     size = 0
     for layer in mixtures.layers:
         # Base64 of 6 bytes per position and 4 per pixel; weight and error as text.
@@ -101,7 +101,7 @@ def page_html(content: Content) -> str:
         'title': html.escape(content.title),
         'style': folder.joinpath('report.css').read_text('utf-8'),
         'script': '\n'.join(folder.joinpath(name).read_text('utf-8') for name in _SCRIPTS),
-        # No JSON string may end the HTML element around it.
+        # Escape "<", so that no JSON string ends the HTML element around the data.
         'data': json.dumps(page_data(content), separators=(',', ':'), allow_nan=False).replace(
             '<', '\\u003c'
         ),
@@ -113,12 +113,12 @@ def page_html(content: Content) -> str:
 
 
 def ground_data(grounds: dict[int, GroundState], stamps: Collection[int]) -> dict[str, Any] | None:
-    """The ground in the data of the page; None if it is unknown at all these times.
+    """Data of the ground for the page; None if the ground is unknown at all given stamps.
 
     Returns:
         `planes`: for each time (a, b, c, d) with a x + b y + c z + d = 0 on the floor, m, camera
-        optical frame, or None; `contacts`: for each time the probability that the foot of each
-        side is on the floor.
+        optical frame, or None; `contacts`: for each time the probability of floor contact of the
+        left and right foot.
     """
     shown = [grounds.get(stamp) for stamp in stamps]
     planes = [None if one is None else one.plane for one in shown]
@@ -142,8 +142,8 @@ def page_data(content: Content) -> dict[str, Any]:
     Positions are `origin + step * int16`, m, in the camera optical frame, with the shape (modes of
     all times in turn, joints, 3) for a layer and (component, time, end, 3) for trajectories. Pixels
     are `int16` times 1/8000 of the width of the image, from the centre of the first pixel; regions
-    of `regions_of` are `region * int16`, m. -32768 means NaN. The page can align skeletons at the
-    centre of their joints `roots`.
+    (see `regions_of`) are `region * int16`, m. -32768 means NaN. The page can align skeletons at
+    the centre of the joints in `roots`.
     """
     grid = _Grid.around(content)
     stamps, truth = content.stamps, content.truth
@@ -262,11 +262,11 @@ def _identities(moments: Sequence[Moment | None]) -> list[list[int]] | None:
 
 
 def _bands(layer: Layer[Moment], stamps: Sequence[int]) -> dict[str, Any] | None:
-    """Intervals of 90 % over time; None if covariances are unknown.
+    """90 % intervals of heights and angles over time; None if covariances are unknown.
 
     Returns:
-        Names of `joints` and `angles`; `values`, `int16` (times, joints and angles, 3), lower end,
-        median and upper end of heights in mm, of angles in tenths of a degree.
+        `joints` and `angles`: their names. `values`: `int16` (times, joints and angles, 3) with
+        lower end, median and upper end; heights in mm, angles in tenths of a degree.
     """
     names = [*layer.joint_names, *layer.angles]
     values = np.full((len(stamps), len(names), 3), np.nan)
@@ -279,7 +279,7 @@ def _bands(layer: Layer[Moment], stamps: Sequence[int]) -> dict[str, Any] | None
     if not joints or not known.any():
         return None
     values[:, :joints] *= 1e3
-    # Angles continue beyond a whole turn.
+    # Unwrap angles, so that they are continuous over time.
     middles = values[known, joints:, 1]
     values[known, joints:] += (np.unwrap(middles, axis=0, period=360.0) - middles)[..., None]
     values[:, joints:] *= 10.0
@@ -288,7 +288,7 @@ def _bands(layer: Layer[Moment], stamps: Sequence[int]) -> dict[str, Any] | None
 
 
 def _whole(values: Array) -> Array:
-    """Rounds values to the range of 16-bit integers; `_NOWHERE` represents NaN."""
+    """Rounds values and clips them to 16-bit integers; NaN becomes `_NOWHERE`."""
     return np.where(np.isnan(values), _NOWHERE, np.clip(np.rint(values), -_LARGEST, _LARGEST))
 
 
@@ -357,7 +357,7 @@ def _detector(detector: Detector, content: Content, grid: _Grid) -> dict[str, An
 def _one_each(
     names: tuple[str, ...], joints: Mapping[int, Array], content: Content, grid: _Grid
 ) -> dict[str, Any]:
-    """One skeleton for each time at which it is known."""
+    """Data of one skeleton over time; `known` marks the times at which it is known."""
     known = [joints[stamp][None] for stamp in content.stamps if stamp in joints]
     positions = np.concatenate([np.zeros((0, len(names), 3)), *known])
     return {

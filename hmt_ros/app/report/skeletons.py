@@ -1,4 +1,4 @@
-"""Skeletons of the modes: on the images that they explain, and from the side.
+"""Draws the modes as skeletons, on the images and from the side.
 
 Left limbs are orange and right limbs blue, which colour-blind people can distinguish; modes of
 smaller weight are fainter.
@@ -44,7 +44,7 @@ BONES = (
         )
     ),
 )
-# Bones of the trunk of a skeleton without a pelvis.
+# Trunk bones of a skeleton without a pelvis.
 _TRUNK_OF_HIPS = ((*HIPS, TRUNK), *(('neck', hip, TRUNK) for hip in HIPS))
 STYLE: Any = {
     'font.size': 9.0,
@@ -60,7 +60,7 @@ _DASHED: Any = (0, (2, 1.2))
 
 
 def bones_of(names: Sequence[str]) -> list[tuple[int, int, str]]:
-    """Indices of the two joints and colour of each bone between the named joints."""
+    """Joint indices and colour of each bone whose two joints are among the names."""
     bones = BONES if ORIGIN in names else (*BONES, *_TRUNK_OF_HIPS)
     return [(names.index(a), names.index(b), c) for a, b, c in bones if {a, b} <= set(names)]
 
@@ -76,7 +76,7 @@ def draw_overview(
 
     Args:
         path: path of the PNG file.
-        track: mixtures; only those with an image are drawn.
+        track: mixtures; only mixtures with an image are drawn.
         camera: camera of the images.
         images: images by stamp.
         truth: true joint positions, drawn from the side; None if unknown.
@@ -127,7 +127,7 @@ def draw_overlays(path: Path, track: Track, camera: Camera, images: dict[int, Im
 
 
 def draw_side_views(path: Path, track: Track, stamps: Sequence[int], truth: Truth | None) -> None:
-    """Draws a sheet of all modes from the side at some times."""
+    """Draws a sheet of side views of all modes at the given stamps."""
     moments = list(track.at(stamps).mixtures.values())
     view = _SideView(track, moments, truth)
     title = 'all modes from the side; horizontal axis: towards the camera, m'
@@ -148,7 +148,7 @@ def new_picture(path: Path, size: tuple[float, float], layout: Any = None) -> It
 
 
 def save_picture(figure: Figure, path: Path) -> None:
-    """Writes a PNG of 256 colours, which is a third of the size of a PNG of all colours."""
+    """Writes a PNG with 256 colours, which has a third of the size of a full-colour PNG."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     pixels = np.asarray(canvas.buffer_rgba())[..., :3]
@@ -215,7 +215,7 @@ def _draw_on_image(
 
 
 class _SideView:
-    """A side view on one scale: axes towards the camera and up from the origin, m."""
+    """A side view with one scale for all times; axes towards the camera and up, m."""
 
     def __init__(self, track: Track, moments: Sequence[Moment], truth: Truth | None) -> None:
         self._names, self._truth = track.joint_names, truth
@@ -304,7 +304,7 @@ def _with_images(track: Track, images: dict[int, Image]) -> list[Moment]:
 
 
 def _crop(moments: list[Moment], camera: Camera) -> tuple[float, ...]:
-    """Left, top, right and bottom of the part of the image that shows the heaviest modes, px."""
+    """Left, top, right and bottom of the image region with the heaviest modes, px."""
     pixels = np.concatenate([camera.project(m.joints[:ON_IMAGE]).reshape(-1, 2) for m in moments])
     pixels = pixels[np.isfinite(pixels).all(1)]
     low, high = pixels.min(0), pixels.max(0)

@@ -1,12 +1,12 @@
-// Poses of people with other lengths of bones; see hmt_ros/image/lifted_poses.py.
+// Joints of poses with scaled bones; see hmt_ros/image/lifted_poses.py.
 #pragma once
 
 #include "../arrays.h"
 
 namespace hmt {
 
-// The joints (C, J, 3) of poses whose bones are longer by factors (J,). `order` (J, 2): each joint
-// and the one that it hangs on by its bone, which comes first; -1: the origin.
+// Scales the bones of poses with joints (C, J, 3) by factors (J,). `order` (J, 2): each joint and
+// the joint at the start of its bone, which comes earlier in the order; -1: the origin.
 inline void resize_bones(const Array<const Index, 2>& order, const Numbers& factors,
                          const Tables& joints, const Tensor& result) {
   const Index count = joints.size(1);

@@ -9,15 +9,15 @@ namespace hmt {
 
 using Rays = Array<const double, 4>;
 
-// Landmarks are looked at no further from the middle of the trunk, in extents, and rays no further
-// from the optical axis: least depth.
+// Maximum distance of a landmark from the middle of the trunk, in extents; minimum depth of a unit
+// ray, which limits its angle from the optical axis.
 inline constexpr double furthest_landmark = 6.0, least_depth = 0.1;
-// Scales of inputs: 1/s of times, of proportions, and what is added to the log of the extent.
+// Scales of inputs: of times, 1/s, and of proportions; constant that is added to the log extent.
 inline constexpr double time_scale = 20.0, proportion_scale = 5.0, usual_extent = 2.0;
 
-// middles (N, 3): rays, z = 1, to the mean of the landmarks of the trunk that are seen in the first
-// image of each window; of all landmarks where fewer than two of the trunk are. A landmark of less
-// than the least confidence is not seen. rays (N, S, L, 2) are x / z and y / z.
+// middles (N, 3): rays with z = 1 to the mean of the trunk landmarks that are seen in the first
+// image of each window, or of all landmarks if fewer than two of the trunk are seen. Landmarks
+// below the minimum confidence are not seen. rays (N, S, L, 2) are x / z and y / z.
 inline void window_middles(const Rays& rays, const Tables& confidences, const Places& trunk,
                            double least_confidence, const Matrix& middles) {
   const Index n = confidences.size(0), s = confidences.size(1), count = confidences.size(2);
@@ -47,10 +47,10 @@ inline void window_middles(const Rays& rays, const Tables& confidences, const Pl
   }
 }
 
-// values (N, p): places in the plane of a camera that looks at the person, over their extent;
-// confidences; which images are there, and how late; the extent; gravity and proportions, each with
-// whether it is known. `axes` (N, 3, 3) are those of that camera, in rows; times (N, S), s, of the
-// images, which should be `wanted` (S,); ups (N, 3) and persons (N, P) are 0 where unknown.
+// values (N, p): positions in the plane of a camera that looks at the person, relative to their
+// extent; confidences; presence and time offset of each image; the extent; gravity and proportions,
+// each with a flag that is 1 if known. `axes` (N, 3, 3) are the axes of that camera, in rows; times
+// (N, S) of the images, s, ideally `wanted` (S,); ups (N, 3) and persons (N, P) are 0 if unknown.
 inline void fill_window_inputs(const Rays& rays, const Tables& confidences, const Table& times,
                                const Numbers& wanted, const Table& ups, const Table& persons,
                                const Tables& axes, double least_confidence,

@@ -5,9 +5,9 @@
 
 namespace hmt {
 
-// Indices of poses (N, 3 J), `limit` at most, in kept (N,), and which of these stands for each pose
-// in owner (N,), -1: none does. Returns how many are kept. The distance of two poses is that of the
-// joint that is furthest apart.
+// Fills kept (N,) with the indices of at most `limit` distinct poses (N, 3 J), and owner (N,) with
+// the place in `kept` of the pose that represents each pose; -1: none. Returns the number of kept
+// poses. The distance of two poses is the largest distance between their joints.
 inline Index keep_distinct(const Table& points, double apart, Index limit,
                            const Array<Index, 1>& kept, const Array<Index, 1>& owner) {
   const Index n = points.size(), width = points.size(1);

@@ -11,13 +11,13 @@
 
 namespace hmt {
 
-// A ray that misses its sphere by less than this touches it, where a limb hangs elsewhere, m.
+// Distance by which a ray may miss its sphere if the start of the limb has moved, m.
 inline constexpr double elsewhere_slack = 0.1;
 
 // The C limbs of a body, of at most K links, D degrees of freedom and J joints that move.
 struct Limbs {
-  Places links, dofs, joints;  // (C,) how many each has
-  // Those of `ChainLinks`, filled up to the largest limb.
+  Places links, dofs, joints;  // (C,) numbers of each limb
+  // Arrays of `ChainLinks`, padded to the size of the largest limb.
   Array<const Index, 2> segments;  // (C, K)
   Places parents;                  // (C,)
   Array<const double, 4> mounts;
@@ -28,7 +28,7 @@ struct Limbs {
   Array<const bool, 3> sides;
   Array<const Index, 2> joint_segments;  // (C, J)
   Tables joint_offsets;                  // (C, J, 3)
-  Places siblings;                       // (C,) the limb of the other side; -1: none
+  Places siblings;                       // (C,) index of the limb of the other side; -1: none
 
   Index size() const { return links.size(); }
   Index width() const { return own.size(1); }
@@ -72,11 +72,11 @@ struct Limbs {
   }
 };
 
-// Configurations of limbs on T trunks; the first trunk is that of G modes.
+// Configurations of limbs on T trunks; G modes share the first trunk.
 struct Configurations {
   Table trunks;                   // (T, d) a pose of each trunk
   Array<const double, 4> angles;  // (T, C, A, D)
-  Array<const Index, 2> counts;   // (T, C) how many there are; 0: those on the first trunk
+  Array<const Index, 2> counts;   // (T, C) number of configurations; 0: those on the first trunk
   Tables penalties;  // (G, C, A) minus the log probability of each on the first trunk, by mode
 
   Index size() const { return trunks.size(); }
@@ -90,7 +90,7 @@ struct Configurations {
   }
 };
 
-// Those that are to be filled.
+// Configurations as a result to be filled.
 struct NewConfigurations {
   Matrix trunks;
   Array<double, 4> angles;
@@ -101,7 +101,7 @@ struct NewConfigurations {
   void check() const { Configurations(*this).check(); }
 };
 
-// Configurations must be those of these limbs, on poses with d degrees of freedom.
+// Checks that configurations fit the limbs, and poses with d degrees of freedom.
 inline void expect_configurations(const char* name, const Configurations& found, const Limbs& limbs,
                                   Index d) {
   const std::string text(name);
@@ -110,7 +110,7 @@ inline void expect_configurations(const char* name, const Configurations& found,
   expect_range("limbs.own", limbs.own, 0, d);
 }
 
-// The number of poses with one configuration each, trunks without any among them.
+// The number of poses with at most one configuration: trunks alone, and each configuration.
 inline Index poses_alone(const Configurations& found) {
   Index total = found.size();
   for (Index count : found.counts) total += count;
@@ -134,8 +134,8 @@ class ConfigurationFiller {
     place(modes[0], lead_);
   }
 
-  // On the first trunk: limbs of the modes, those found, in the other side's place; each with its
-  // flips, which are not to be crowded out by modes that tremble.
+  // On the first trunk: limbs of the modes, further limbs, and limbs in the other side's place.
+  // Each is followed by its flips, so that small differences between modes do not displace flips.
   void fill_first() {
     result_.trunks[0].copy_from(modes_[0]);
     for (Index c = 0; c < limbs_.size(); ++c) {
@@ -151,7 +151,7 @@ class ConfigurationFiller {
     }
   }
 
-  // On trunk t: a pair of limbs, each in the other's place; false where one can not be there.
+  // On trunk t: a pair of limbs, each in the other's place; false if a limb cannot reach it.
   bool fill_exchanged(Index t, Index c) {
     result_.trunks[t].copy_from(modes_[0]);
     result_.counts[t].fill(0);
@@ -165,7 +165,7 @@ class ConfigurationFiller {
     return true;
   }
 
-  // On trunk t: the torso flipped (d,), with each limb on its rays.
+  // On trunk t: the pose `flipped` (d,), with each limb on its rays.
   void fill_flipped(Index t, const Numbers& flipped) {
     result_.trunks[t].copy_from(flipped);
     place(flipped, moved_);
@@ -198,7 +198,7 @@ class ConfigurationFiller {
   const Index segments_ = tree_.segments(), d_ = tree_.dimension();
   const Index links_ = limbs_.segments.size(1), width_ = limbs_.width();
   const Index leaf_count_ = limbs_.most_leaves();
-  const Index sources_ = modes_.size() + found_.size(1) + leaf_count_;  // of a limb, at most
+  const Index sources_ = modes_.size() + found_.size(1) + leaf_count_;  // maximum number for a limb
   Placed lead_{segments_}, moved_{segments_}, tried_{segments_};
   Scratch<double, 2> axes_{d_, 3}, dof_origins_{d_, 3};
   Scratch<double, 1> pose_{d_};
@@ -206,7 +206,7 @@ class ConfigurationFiller {
   Scratch<bool, 1> valid_{leaf_count_};
   TreeGrowth growth_{links_, width_};
   Scratch<double, 2> given_{sources_, width_};  // configurations without their flips
-  Scratch<Index, 1> firsts_{sources_};          // where each of them is among all
+  Scratch<Index, 1> firsts_{sources_};          // index of each among all configurations
   Scratch<double, 2> angles_{sources_ * (1 + leaf_count_), width_};
   Scratch<double, 2> points_{angles_.size(), 3 * limbs_.joint_segments.size(1)};
   Scratch<Index, 1> kept_{angles_.size()}, owner_{angles_.size()};
@@ -223,7 +223,7 @@ class ConfigurationFiller {
     for (Index j = 0; j < limbs_.dofs[c]; ++j) pose[limbs_.own(c, j)] = angles[j];
   }
 
-  // Configurations of limb c without their flips; how many there are.
+  // Gathers configurations of limb c without flips; returns their number.
   Index gather(Index c) {
     Index count = 0;
     for (Index g = 0; g < modes_.size(); ++g) read_limb(c, modes_[g], given_[count++]);
@@ -235,7 +235,7 @@ class ConfigurationFiller {
     return count;
   }
 
-  // All configurations of limb c: those gathered, each before its flips; how many there are.
+  // Lists the gathered configurations of limb c, each followed by its flips; returns their number.
   Index flip_all(Index c, Index sources) {
     Index n = 0;
     for (Index i = 0; i < sources; ++i) {
@@ -249,9 +249,10 @@ class ConfigurationFiller {
     return n;
   }
 
-  // Writes the leaves of the tree of limb c on a trunk into rows (A, D) of out; how many there are.
-  // The joints are on the rays of those of another limb in other frames. The angles of the pose
-  // (d,) are near. Slack 0: the joints are those of the pose, which is left out.
+  // Writes the leaves of the tree of limb c on a trunk into rows (A, D) of out; returns their
+  // number. The joints lie on the rays of the joints of limb `other` in the frames `seen`. Of
+  // equivalent angles, those nearest to the pose (d,) are taken. With slack 0 the joints are those
+  // of the pose, and the pose itself is left out.
   Index hang(Index c, const Placed& trunk, const Numbers& pose, Index other, const Placed& seen,
              double slack, const Matrix& out) {
     const ChainLinks chain = limbs_.chain(c);
@@ -274,8 +275,8 @@ class ConfigurationFiller {
     return n;
   }
 
-  // Keeps the distinct ones of the first n configurations of limb c for trunk t, that of a pose
-  // (d,).
+  // Keeps the distinct ones of the first n configurations of limb c for trunk t, the trunk of a
+  // pose (d,).
   void keep(Index t, Index c, const Placed& trunk, const Numbers& pose, Index n) {
     tried_.columns.view().copy_from(trunk.columns);
     tried_.origins.view().copy_from(trunk.origins);
@@ -306,10 +307,10 @@ class ConfigurationFiller {
 };
 
 // Fills the configurations of G modes (G, d), see `LimbProducts.of`: found (C, F, D) are further
-// angles of the limbs, as many as found_counts (C,) say; flipped (M, d) have other torsos. The last
-// trunks are left out, so that no more than `most` poses with one configuration each are there, but
-// for those of the first. Returns the numbers of trunks and of those with limbs that have changed
-// places, which follow the first.
+// angles of the limbs, found_counts (C,) their numbers; flipped (M, d) are poses with other torsos.
+// Trunks are left out from the end, so that at most `most` poses with one configuration remain, not
+// counting the first trunk. Returns the number of trunks, and the number of trunks with exchanged
+// limbs, which follow the first trunk.
 inline std::tuple<Index, Index> fill_configurations(const Placing& tree, const Limbs& limbs,
                                                     const Table& modes, const Tables& found,
                                                     const Places& found_counts,
@@ -355,8 +356,8 @@ inline std::tuple<Index, Index> fill_configurations(const Placing& tree, const L
   return {t, exchanged};
 }
 
-// Fills poses (R, d) with each trunk, and with each configuration that its trunk does not have;
-// returns how many there are. Rows (R,) become the pose of each trunk, then of its configurations.
+// Fills poses (R, d) with each trunk, and with each configuration that differs from its trunk;
+// returns their number. `rows` (R,) become the pose of each trunk, then of its configurations.
 inline Index place_alone(const Limbs& limbs, const Configurations& found, const Matrix& poses,
                          const Array<Index, 1>& rows) {
   expect_configurations("found", found, limbs, poses.size(1));
@@ -384,16 +385,16 @@ inline Index place_alone(const Limbs& limbs, const Configurations& found, const 
   return count;
 }
 
-// The choices of one entry a list with the least sums, the least first, list by list: each entry of
-// a list stands before all sums so far, which are in order, and the least of the heads goes on.
-// Equal sums stand in the order of the lists.
+// Finds the choices of one entry per list with the smallest sums, in order. Lists are added one by
+// one: each entry of a list has a position in the sorted previous sums, and the smallest total is
+// taken next. Ties are broken by the order of the previous sums.
 class LeastSums {
  public:
   LeastSums(Index lists, Index longest, Index limit)
       : sums_(limit), picks_(limit, lists), heads_(longest) {}
 
-  // Fills sums (limit,) and picks (limit, C) from costs (C, A) of lists of these sizes (C,); how
-  // many there are.
+  // Fills sums (limit,) and picks (limit, C) from costs (C, A) of lists of these sizes (C,);
+  // returns their number.
   Index find(const Table& costs, const Places& sizes, const Vector& sums,
              const Array<Index, 2>& picks) {
     Index n = 1;
@@ -416,7 +417,7 @@ class LeastSums {
   }
 
  private:
-  // Sums and picks of the lists before, and where each entry of a list stands among them.
+  // Sums and picks of the previous lists, and the position of each entry of a list among them.
   Scratch<double, 1> sums_;
   Scratch<Index, 2> picks_;
   Scratch<Index, 1> heads_;
@@ -458,7 +459,7 @@ class Combiner {
     }
   }
 
-  // Finds the best products on trunk t for mode g, with that log weight.
+  // Finds the best products on trunk t for mode g of the given log weight.
   void find(Index t, Index g, double log_weight) {
     for (Index c = 0; c < limbs_.size(); ++c) {
       const Index at = origin_(t, c);
@@ -471,8 +472,8 @@ class Combiner {
     for (Index i = 0; i < sizes_[g]; ++i) sums_(g, i) -= log_weight;
   }
 
-  // Merges those of the first modes on trunk t into the rows of poses, parents and values; how many
-  // there are. The same product of several modes: the best is its parent.
+  // Merges the products of the first modes on trunk t into the rows of poses, parents and values;
+  // returns their number. If several modes have the same product, the best one is its parent.
   Index merge(Index t, Index modes, const Matrix& poses, const Array<Index, 1>& parents,
               const Vector& values) {
     heads_.fill(0);
@@ -504,18 +505,18 @@ class Combiner {
   Index count_;
   const Index trunks_ = found_.size(), limit_ = limbs_.size(), most_ = found_.most();
   Scratch<double, 1> bases_{trunks_};                   // energies of the trunks
-  Scratch<double, 3> changes_{trunks_, limit_, most_};  // of the energy by each configuration
-  // How many configurations there are, and the trunk that has them.
+  Scratch<double, 3> changes_{trunks_, limit_, most_};  // energy change by each configuration
+  // Numbers of configurations, and the trunk that has them.
   Scratch<Index, 2> counts_{trunks_, limit_}, origin_{trunks_, limit_};
   Scratch<double, 2> costs_{limit_, most_};
-  // Products of each mode, and the first that was not yet taken.
+  // Products of each mode, and the first that is not taken yet.
   Scratch<double, 2> sums_{modes_.size(), count_};
   Scratch<Index, 3> picks_{modes_.size(), count_, limit_};
   Scratch<Index, 1> sizes_{modes_.size()}, heads_{modes_.size()};
   Scratch<Index, 2> taken_{count_, limit_};
   LeastSums least_sums_{limit_, most_, count_};
 
-  // The mode whose next product is the best; -1 if missing.
+  // The mode whose next product is the best; -1 if none is left.
   Index best_mode(Index modes) const {
     Index best = -1;
     for (Index g = 0; g < modes; ++g) {
@@ -535,9 +536,9 @@ class Combiner {
 };
 
 // Fills poses (T count, d), parents and values (T count,) with the best products on each trunk, see
-// `LimbProducts.best`; returns how many there are. Energies (R,) are those of the poses alone,
-// log_weights (G,) those of the modes (G, d). After the first trunk follow `exchanged` ones, at a
-// price, and then those with another torso, at another.
+// `LimbProducts.best`; returns their number. Energies (R,) belong to poses with at most one
+// configuration, log_weights (G,) to the modes (G, d). The first trunk is followed by `exchanged`
+// trunks, at one price, and then by trunks with other torsos, at another price.
 inline Index combine(const Limbs& limbs, const Table& modes, const Configurations& found,
                      const Numbers& energies, const Numbers& log_weights, Index exchanged,
                      double exchange, double flip, double share, Index count, const Matrix& poses,

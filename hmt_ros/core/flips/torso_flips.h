@@ -7,7 +7,7 @@
 namespace hmt {
 
 struct Torso {
-  static constexpr double significant = 0.04;  // a flip changes the depth of some joint by more, m
+  static constexpr double significant = 0.04;  // minimum change of depth of some joint, m
   // Rows of the joints.
   enum { pelvis, neck, left_hip, right_hip, left_shoulder, right_shoulder, joint_count };
 
@@ -53,7 +53,7 @@ class TorsoFlips {
     }
   }
 
-  // Flips the pose that was read; whether the limits allow it and it changes some depth.
+  // Flips the pose that was read; returns whether the limits allow it and some depth changes.
   bool flip(bool turn_hips, bool lean, bool turn_shoulders, const Vector& pose) {
     double hips[3], shoulders[3];
     wish(hips_, joints_[Torso::pelvis], turn_hips, hips);
@@ -81,11 +81,11 @@ class TorsoFlips {
   const Index segments_ = tree_.segments(), d_ = tree_.dimension();
   Scratch<double, 3> columns_{segments_, 3, 3};
   Scratch<double, 2> origins_{segments_, 3}, axes_{d_, 3}, dof_origins_{d_, 3};
-  // Of the pose that was read: joints, from left to right hip and shoulder, where the trunk starts,
-  // and the z axis of the root.
+  // Of the pose that was read: joints, lines from left to right hip and shoulder, start of the
+  // trunk, and z axis of the root.
   double joints_[Torso::joint_count][3], hips_[3], shoulders_[3], before_[3], z_[3];
 
-  // A line (3,), with its component along the ray to a point reversed if it turns.
+  // A line (3,); if it turns, its component along the ray to a point is reversed.
   static void wish(const double* line, const double* at, bool turns, double* wanted) {
     std::copy_n(line, 3, wanted);
     if (!turns) return;
@@ -95,8 +95,8 @@ class TorsoFlips {
     for (int k = 0; k < 3; ++k) wanted[k] = line[k] - twice * ray[k];
   }
 
-  // Where the neck (3,) goes on its ray when the trunk starts elsewhere, on the other side of that
-  // start if it leans; whether it gets there.
+  // Moves the neck (3,) along its ray for a new start of the trunk, to the other side of the start
+  // if the trunk leans; returns whether the neck can reach the ray.
   bool place_neck(const double* start, bool lean, double* wanted) const {
     const double* neck = joints_[Torso::neck];
     const double distance = std::sqrt(dot(neck, neck));
@@ -113,8 +113,8 @@ class TorsoFlips {
     return reach > 0.0;
   }
 
-  // Turns the root of a pose (d,): its x axis follows the hips, its z axis stays near z. Whether it
-  // is within the limits.
+  // Turns the root of a pose (d,): its x axis follows the hips, its z axis stays near z. Returns
+  // whether it is within the limits.
   bool turn_root(const double* hips, const Vector& pose) const {
     const double width = std::sqrt(dot(hips, hips));
     const double x[3] = {hips[0] / width, hips[1] / width, hips[2] / width};
@@ -129,7 +129,7 @@ class TorsoFlips {
     for (int i = 0; i < 3; ++i) {
       for (int k = 0; k < 3; ++k) mount[i][k] = tree_.mounts(0, k, i);
     }
-    // R = mount' [x y z]; its elements that tell the angles about z, y and x.
+    // Elements of R = mount' [x y z] that determine the angles about z, y and x.
     const double xx = dot(mount[0], x), yx = dot(mount[1], x), zx = dot(mount[2], x);
     const double zy = dot(mount[2], y), zz = dot(mount[2], z);
     const bool first = set(torso_.root[0], elementary::atan2(yx, xx), pose);
@@ -138,8 +138,8 @@ class TorsoFlips {
     return first && second && third;
   }
 
-  // Turns the trunk of a placed pose (d,) up as wanted, its x axis along the shoulders. Whether it
-  // is within the limits.
+  // Turns the trunk of a placed pose (d,) up as wanted, its x axis along the shoulders. Returns
+  // whether it is within the limits.
   bool turn_trunk(const double* up, const double* shoulders, const Vector& pose) const {
     const Index segment = torso_.segment;
     const Places own = torso_.trunk;
@@ -168,7 +168,8 @@ class TorsoFlips {
     return first && second && third;
   }
 
-  // Sets an angle of a pose (d,), nearest to the old one modulo a turn; whether it may be.
+  // Sets an angle of a pose (d,), modulo a turn nearest to the old one; returns whether it is
+  // valid.
   bool set(Index j, double angle, const Vector& pose) const {
     const double near = angle + 2.0 * pi * std::rint((pose[j] - angle) / (2.0 * pi));
     pose[j] = near;
@@ -176,8 +177,8 @@ class TorsoFlips {
   }
 };
 
-// Fills the flips, rows of result (N F, d), of poses (N, d), and where each comes from, parents
-// (N F,); returns how many there are.
+// Fills rows of result (N F, d) with the flips of poses (N, d), and parents (N F,) with the index
+// of the pose of each; returns the number of flips.
 inline Index fill_torso_flips(const Placing& tree, const Torso& torso, const Table& poses,
                               const Matrix& result, const Array<Index, 1>& parents) {
   const Index n = poses.size(), d = tree.dimension(), most_flips = n * torso.flips.size();

@@ -4,8 +4,8 @@
 //
 //     s r,    s = r.P +- sqrt((r.P)^2 - |P|^2 + l^2).
 //
-// Joint angles follow by descending the chain, with v the z axis of the segment seen from the frame
-// before its rotations:
+// Joint angles follow by descending the chain, with v the z axis of the segment in the frame before
+// its rotations:
 //
 //     spherical, first two   v = (sin b, -sin a cos b, cos a cos b)
 //     its third, and hinge   v = (sin c sin e, -cos c sin e, cos e)
@@ -18,24 +18,25 @@
 namespace hmt {
 
 inline constexpr double turn = 2.0 * pi;
-inline constexpr double touching = 1e-6;  // two solutions nearer than this are one, m
-// Sine of an elbow or knee angle below which the segments count as straight: their twist is free.
+inline constexpr double touching = 1e-6;  // distance below which two solutions are one, m
+// Sine of an elbow or knee angle below which the segments count as straight, and their twist is
+// free.
 inline constexpr double straight = 1e-6;
 inline constexpr double limit_tolerance = 1e-9;  // rad
 
 // A chain of K links with D degrees of freedom; a link has 3 (x y z), 1 (x) or 2 (x y) of them.
 struct ChainLinks {
-  static constexpr Index most_links = 20;  // so that 4^K and its multiples are an Index
+  static constexpr Index most_links = 20;  // so that multiples of 4^K fit into an Index
 
   Places segments;             // (K,)
-  Index parent;                // the segment that the chain hangs on
+  Index parent;                // parent segment of the chain
   Tables mounts;               // (K, 3, 3)
   Mask mounted;                // (K,) whether the mount is not the identity
   Numbers lengths;             // (K,) from joint to joint, m
-  Places first_dofs;           // (K + 1,) those of link k start here
+  Places first_dofs;           // (K + 1,) first degree of freedom of each link
   Places dofs;                 // (D,)
   Numbers lower, upper;        // (D,) rad
-  Array<const bool, 2> sides;  // (K, 2) which of its two solutions the limits of a link admit
+  Array<const bool, 2> sides;  // (K, 2) whether limits of a link allow each solution
 
   Index links() const { return segments.size(); }
   Index leaves() const { return Index{1} << links(); }
@@ -63,7 +64,8 @@ struct Nearest {
   bool fits;
 };
 
-// The angle plus the multiple of 2 pi that fits the limits; if several, nearest the given.
+// The angle plus a multiple of 2 pi within the limits; if several fit, the nearest to the given
+// angle.
 inline Nearest into_limits(double angle, double lower, double upper, double given) {
   double shifted = angle + turn * std::rint((given - angle) / turn);
   if (shifted < lower - limit_tolerance) shifted += turn;
@@ -72,7 +74,7 @@ inline Nearest into_limits(double angle, double lower, double upper, double give
   return {between(shifted, lower, upper), fits};
 }
 
-// Grows the trees of chains of at most so many links and degrees of freedom.
+// Grows the trees of chains with limited numbers of links and degrees of freedom.
 class TreeGrowth {
  public:
   TreeGrowth(Index links, Index dofs)
@@ -84,14 +86,14 @@ class TreeGrowth {
         given_(dofs),
         found_(dofs) {}
 
-  // Fills the angles (2^K, D) and sets valid (2^K,) where there is a leaf, depth first: dead
-  // branches have no leaves to visit. The bits of the number of a leaf, highest first, say which of
-  // the two solutions each link takes.
+  // Fills the angles (2^K, D) and sets valid (2^K,) for existing leaves, depth first; dead branches
+  // are skipped. The bits of the number of a leaf, highest first, select one of the two solutions
+  // of each link.
   //
-  // The chain hangs at `start` (3,) in the frame `base` (3, 3), row i its axis i; targets (K, 3)
-  // are points on the rays of the joints. The angles nearest to those of the pose (d,) are taken. A
-  // ray that misses its sphere by less than the slack touches it. The given stays: the targets are
-  // joints of the pose, which comes out first.
+  // The chain starts at `start` (3,) in the frame `base` (3, 3), whose rows are axes; targets (K,
+  // 3) are points on the rays of the joints. Of equivalent angles, those nearest to the pose (d,)
+  // are taken. A ray that misses its sphere by less than the slack counts as touching. If the given
+  // pose stays, the targets are its joints, and the pose is the first leaf.
   void grow(const ChainLinks& chain, const double* start, const double* base, const Table& targets,
             const Numbers& pose, double slack, bool given_stays, const Matrix& angles,
             const Array<bool, 1>& valid) {
@@ -109,7 +111,7 @@ class TreeGrowth {
         std::copy_n(found_.view().data, d, angles[leaf].data);
         k = last;
       }
-      // On to the second solution of the last link that has not yet had it.
+      // Continue with the second solution of the last link that has not taken it yet.
       leaf = ((leaf >> (last - k)) + 1) << (last - k);
       for (k = last; k > 0 && !((leaf >> (last - k)) & 1);) --k;
     }
@@ -119,7 +121,8 @@ class TreeGrowth {
   // Of the tree: unit rays (K, 3), distances and signs (K,) of the targets.
   Scratch<double, 2> rays_;
   Scratch<double, 1> distances_, signs_;
-  // Of the branch at hand: the joints, the frames that the links turn from, and the angles.
+  // Of the current branch: the joints, the frames before the rotations of the links, and the
+  // angles.
   Scratch<double, 2> joints_;
   Scratch<double, 3> frames_;
   Scratch<double, 1> given_, found_;
@@ -134,18 +137,19 @@ class TreeGrowth {
       const double *target = targets[k].data, *ray = rays_[k].data;
       distances_[k] = std::sqrt(dot(target, target));
       for (int x = 0; x < 3; ++x) rays_(k, x) = target[x] / distances_[k];
-      // The given pose takes the far solution where its joint lies beyond the foot of the parent.
+      // The given pose takes the far solution if its joint lies beyond the point of the ray that is
+      // nearest to the parent.
       signs_[k] = distances_[k] >= dot(ray, before) ? 1.0 : -1.0;
       before = target;
     }
   }
 
-  // Places the end of link k onto its ray; false where it can not be there.
+  // Places the end of link k on its ray; false if the link cannot reach the ray.
   bool put_joint(double length, Index k, bool second, bool stays, double slack) {
     const double *p = joints_[k].data, *ray = rays_[k].data;
     double* joint = joints_[k + 1].data;
     double s = distances_[k];
-    // The given pose itself stays, however the rounding of its discriminant turns out.
+    // The given pose stays, even if rounding makes its discriminant negative.
     if (!stays) {
       const double along = dot(p, ray);
       const double discriminant = along * along - dot(p, p) + length * length;
@@ -158,7 +162,7 @@ class TreeGrowth {
     }
     for (int x = 0; x < 3; ++x) joint[x] = s * ray[x];
     if (slack > 0.0) {
-      // A joint put on the nearest point of a ray that misses keeps the length of its link.
+      // If the ray is out of reach, the link points at its nearest point and keeps its length.
       const double arm[3] = {joint[0] - p[0], joint[1] - p[1], joint[2] - p[2]};
       const double scale = length / most(std::sqrt(dot(arm, arm)), 1e-9);
       for (int x = 0; x < 3; ++x) joint[x] = p[x] + scale * arm[x];
@@ -166,20 +170,20 @@ class TreeGrowth {
     return true;
   }
 
-  // Angles that point link k at its joint, and the frame beyond; false where no limits allow.
+  // Sets the angles that point link k at its joint, and the next frame; false outside the limits.
   bool bend(const ChainLinks& chain, Index k) {
     const Index at = chain.first_dofs[k], dofs = chain.dofs_of(k);
     const bool inner = k + 1 < chain.links();
     const double *joint = joints_[k].data, *end = joints_[k + 1].data;
     double z[3], v[3];
     for (int x = 0; x < 3; ++x) z[x] = (joint[x] - end[x]) / chain.lengths[k];
-    // The frame beyond the mount is built where the next link looks for its own.
+    // Build the frame after the mount in the place of the frame of the next link.
     mount(chain, k);
     double* frame = frames_[k + 1].data;
     for (int i = 0; i < 3; ++i) v[i] = dot(frame + 3 * i, z);
     if (dofs == 1) {
       const double e = elementary::acos(between(v[2], -1.0, 1.0));
-      // Until here the twist of the spherical joint was left out of the frame.
+      // So far the frame does not include the twist of the spherical joint.
       const bool fits = choose(chain, k, at - 1, at, e, -e, v[0], -v[1]);
       if (inner && fits) {
         turn_about(frame, found_[at - 1], 2);
@@ -216,9 +220,10 @@ class TreeGrowth {
     }
   }
 
-  // Finds angles i and j of link k within their limits, of two solutions those nearest the given;
-  // false if missing. Angle j is one or two; angle i is that of (x, y), turned by pi for the
-  // second, and stays where (x, y) vanishes: it has no effect on the segment.
+  // Finds angles i and j of link k within their limits; of two solutions, those nearest to the
+  // given angles; false if none. Angle j is `one` or `two`. Angle i is the angle of (x, y), turned
+  // by pi for the second solution; it is kept if (x, y) vanishes, because it has no effect on the
+  // segment then.
   bool choose(const ChainLinks& chain, Index k, Index i, Index j, double one, double two, double y,
               double x) {
     const bool free = std::sqrt(y * y + x * x) < straight;

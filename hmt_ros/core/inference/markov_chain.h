@@ -6,8 +6,8 @@
 
 namespace hmt {
 
-// Moves a joint probability (2^n,) of n chains on by dt seconds, each with the rates (n, 2) at
-// which it begins and ends, 1/s. The first chain has the outer axis.
+// Predicts a joint probability (2^n,) of n chains over dt seconds; the rates (n, 2), 1/s, are those
+// of entering and leaving the second state. The first chain has the outer axis.
 inline void step_chains(const Table& rates, double dt, const Vector& joint) {
   const Index chains = rates.size(), states = joint.size();
   expect_shape("rates", rates, {-1, 2});

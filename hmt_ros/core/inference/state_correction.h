@@ -1,4 +1,4 @@
-// States of modes: predicted with damped velocities, conditioned on where poses were found, and
+// States of modes: predicted with damped velocities and conditioned on fitted poses, and
 // covariances of jumps; equations in hmt_ros/inference/motion_states.py and damped_velocity.py.
 #pragma once
 
@@ -9,7 +9,7 @@ namespace hmt {
 
 namespace matrices {
 
-// Equal blocks of n columns side by side, each padded; as `factorise` and `solve_upper` take them.
+// Equal blocks of n columns side by side, each padded, for `factorise` and `solve_upper`.
 class Blocks {
  public:
   Blocks(Index rows, std::initializer_list<Index> columns) : starts_{0} {
@@ -41,7 +41,7 @@ inline void expect_factor(bool good, const char* name) {
 
 }  // namespace matrices
 
-// Moves K states (K, 2 d) with their covariances on: x + a v and b v, with a, b (d,) and the noise
+// Predicts K states (K, 2 d) with their covariances: x + a v and b v, with a, b (d,) and the noise
 // (2 d, 2 d).
 inline void predict_damped(const Numbers& a, const Numbers& b, const Table& noise,
                            const Table& means, const Tables& covariances, const Matrix& moved,
@@ -64,7 +64,7 @@ inline void predict_damped(const Numbers& a, const Numbers& b, const Table& nois
         spread(i, d + j) = carried * b[j];
         spread(d + j, i) = carried * b[j];
         spread(d + i, d + j) = b[i] * b[j] * known(d + i, d + j);
-        // The transposed half comes from the other turn of the loops.
+        // The mirrored iteration sets the transposed half.
         spread(j, i) = carried * a[j];
       }
     }
@@ -75,8 +75,8 @@ inline void predict_damped(const Numbers& a, const Numbers& b, const Table& nois
   }
 }
 
-// Fills the inverses (N, d, d) of covariances to which `wandered` (d,) is added where an ancestor
-// jumped, given the inverses of the ancestors (K, d, d):
+// Fills the inverses (N, d, d) of the ancestors' covariances with `wandered` (d,) added to
+// variables that jumped, from the inverses (K, d, d) of the ancestors' covariances:
 //
 //     (C + W)^-1 = P - P S (I + S P S)^-1 S P,    W = S S, over the variables that jumped
 inline void widen_precisions(const Tables& precisions, const Places& ancestors,
@@ -145,7 +145,7 @@ inline void fuse(const Tables& a, const Tables& b, const Tensor& result) {
   }
 }
 
-// Predicted states of K modes, for the next.
+// Predicted states of K modes, as input of the next function.
 struct Predicted {
   Table means;         // (K, 2 d)
   Tables covariances;  // (K, 2 d, 2 d)
@@ -153,8 +153,8 @@ struct Predicted {
   Table unknown_velocity;  // (d, d)
 };
 
-// Fills the velocities (N, d) and covariances (N, 2 d, 2 d) of states whose poses have been found:
-// (N, d), with covariances (N, d, d).
+// Fills the velocities (N, d) and covariances (N, 2 d, 2 d) of states, given their poses (N, d)
+// with covariances (N, d, d).
 inline void correct_states(const Predicted& predicted, const Places& ancestors,
                            const Array<const bool, 2>& jumped, const Table& poses,
                            const Tables& found, const Matrix& velocities, const Tensor& result) {
@@ -182,7 +182,8 @@ inline void correct_states(const Predicted& predicted, const Places& ancestors,
       std::copy_n(&known(i, d), d, blocks.row(1, i));
       if (fresh[i]) blocks.row(0, i)[i] += predicted.unknown_variance;
     }
-    // With P_xx = U' U the block beside it becomes Y = U'^-1 P_xv, so that G P_xv = Y' Y; then G'.
+    // With P_xx = U' U the block to its right becomes Y = U'^-1 P_xv, so that G P_xv = Y' Y; then
+    // G'.
     expect_factor(factorise(blocks.rows(), d), "predicted.covariances");
     multiply(blocks.transposed(1), blocks.matrix(1), rows_of(loss[0].data, d), d, d, d,
              room.view().data);
@@ -199,7 +200,7 @@ inline void correct_states(const Predicted& predicted, const Places& ancestors,
       for (Index j = 0; j < d; ++j) {
         to(i, j) = found(n, i, j);
         to(d + i, j) = to(j, d + i) = fresh[i] ? 0.0 : together(i, j);
-        // An unknown velocity is correlated with no other.
+        // An unknown velocity is not correlated with others.
         if (fresh[i] || fresh[j]) {
           to(d + i, d + j) = fresh[i] && fresh[j] ? predicted.unknown_velocity(i, j) : 0.0;
         } else {

@@ -1,18 +1,18 @@
-// States of a chain of Gaussians: those that make
+// States of a chain of Gaussians, which minimise
 //
 //     E(X) = x_1' K x_1 / 2 - p' x_1 + sum_t s_t |x_(t+1) - A_t x_t|^2_(Q_t) / 2
 //            + sum_t |x_t - z_t|^2_(R_t) / 2 + sum_t |J_(t+1) x_(t+1) + c_(t+1) - J_t x_t -
 //            c_t|^2_w / 2
 //
-// least, whose Hessian is block-tridiagonal; see hmt_ros/smoothing/motion_smoother.py.
+// The Hessian is block-tridiagonal; see hmt_ros/smoothing/motion_smoother.py.
 #pragma once
 
 #include "../block_tridiagonal.h"
 
 namespace hmt {
 
-// What states are before images speak: A' Q^-1 A, Q^-1 and Q^-1 A of some intervals, (I, n, n),
-// which of them is between two states, its share s, and K and p of the first state.
+// Prior of the states: A' Q^-1 A, Q^-1 and Q^-1 A of I intervals, (I, n, n); the interval between
+// each two states, its share s; and K and p of the first state.
 struct ChainPrior {
   Tables before, after, forth;
   Places which;
@@ -50,7 +50,7 @@ inline void add_weighed(const Matrix& columns, Index first, const Table& jacobia
 }
 
 // Fills the Hessian into columns (T n, 2 n) of a band, from the last state to the first, and adds
-// what pulls the states to the right side (T n).
+// the linear terms to the right-hand side (T n).
 HMT_WIDE inline void fill_chain(const ChainPrior& prior, const Tables& precisions,
                                 const Table& means, const RestingTable& resting,
                                 const Matrix& columns, const Vector& right) {
@@ -103,8 +103,8 @@ HMT_WIDE inline void fill_chain(const ChainPrior& prior, const Tables& precision
 }
 
 // Factorises the Hessian into the columns of a band, and fills the states (T, n). Precisions (T, d,
-// d) and means (T, d) are R^-1 and z. Returns how many columns have a pivot, as `factorise_band`;
-// if not all, there are no states.
+// d) and means (T, d) are R^-1 and z. Returns the number of columns with a pivot, as
+// `factorise_band`; if not all, states are not valid.
 inline Index condition_chain(const ChainPrior& prior, const Tables& precisions, const Table& means,
                              const RestingTable& resting, const Matrix& columns,
                              const Matrix& states) {

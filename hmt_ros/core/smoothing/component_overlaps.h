@@ -4,7 +4,7 @@
 //
 // see hmt_ros/smoothing/variational_mixture.py. L_j' is read column by column from the band. The
 // distance to another component is summed from the column at which it is greatest, until the
-// component no longer counts.
+// overlap is negligible.
 #pragma once
 
 #include "../elementary.h"
@@ -14,10 +14,11 @@
 namespace hmt {
 
 inline constexpr double negligible_overlap = 40.0;  // a difference of log densities
-inline constexpr Index overlap_stride = 32;  // columns between looks at whether one still counts
+inline constexpr Index overlap_stride = 32;         // columns between checks of negligible overlap
 
 // Adds L y, (D,), of a band L (D, width) and y (D,) to the first entries of a sum (D + width,). Two
-// columns at once: what one has stored, shifted by one entry, the next could not load at once.
+// columns are added at once, because loads that are shifted by one entry must wait for the stores
+// before.
 [[gnu::always_inline]] inline void add_columns(const Table& band, const Numbers& y,
                                                const Vector& sum) {
   const Index total = band.size(), width = band.size(1);

@@ -11,8 +11,8 @@ namespace hmt {
 inline constexpr double negligible_mode = 60.0;
 
 // Writes value (N,), gradient (N, d) and, if `second`, Hessian (N, d, d) at poses (N, d) of times
-// (N,); with `exact` the Hessian has its negative part. The modes of time t are first[t] up to
-// first[t + 1]; log_scales (K,), means (K, d), whiteners and precisions (K, d, d).
+// (N,); with `exact` the Hessian has its negative part. The modes of time t are first[t] to first[t
+// + 1] - 1; log_scales (K,), means (K, d), whiteners and precisions (K, d, d).
 HMT_WIDE inline void add_mixture_energy(const Table& poses, const Places& times,
                                         const Places& first, const Numbers& log_scales,
                                         const Table& means, const Tables& whiteners,
@@ -41,7 +41,7 @@ HMT_WIDE inline void add_mixture_energy(const Table& poses, const Places& times,
   for (Index i = 0; i < poses_count; ++i) {
     const Index start = first[times[i]], count = first[times[i] + 1] - start;
     const double* pose = poses[i].data;
-    // The mode that explains the pose, roughly: the others are given up early against it.
+    // Find a mode that explains the pose well, so that the others are rejected early.
     Index leading = 0;
     for (Index k = 0; k < count; ++k) {
       const Index mode = start + k;

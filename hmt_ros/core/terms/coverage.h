@@ -12,10 +12,9 @@
 
 namespace hmt {
 
-// Pixels that a unit of difference in direction counts as when outline and contour are matched.
+// Weight of a unit difference in direction when outline and contour are matched, px.
 inline constexpr double outline_turn = 12.0;
-// Along the outline distances up to this, px, cost nothing: the contour's points stand that far
-// apart.
+// Distance along the outline without cost, px, which is the spacing of the contour's points.
 inline constexpr double outline_spacing = 8.0;
 
 // M samples on the outline of a silhouette.
@@ -34,8 +33,8 @@ struct Outline {
 struct CoverageInputs {
   Weighting term;
   Outline outline;
-  Table explained;  // (X, M) maximum energy of samples; a row a pose, or one row for all
-  Matrix costs;     // (N, M) result: energy of each sample; no rows: it is not wanted
+  Table explained;  // (X, M) maximum energy of samples; one row per pose or one for all
+  Matrix costs;     // (N, M) result: energy of each sample; no rows: not wanted
 
   void check() const {
     expect_shape("costs", costs, {-1, outline.count()});
@@ -48,7 +47,7 @@ struct CoverageInputs {
   }
 };
 
-// The points of a contour that no other part covers; all that exist where it is covered everywhere.
+// The points of a contour that no other part covers; all existing points if all are covered.
 inline Index matched_points(const Contour& contour, Index* use) {
   Index used = 0;
   for (Index i = 0; i < contour.count; ++i) {
@@ -63,7 +62,7 @@ inline Index matched_points(const Contour& contour, Index* use) {
   return used;
 }
 
-// For so many samples (4, M), whole lanes, the place in `use` of the nearest point (4,): pixel and
+// For samples (4, M), in whole lanes, the place in `use` of the nearest point (4,): pixel and
 // scaled normal.
 inline void find_nearest(const float* points, Index number, const float* samples, Index count,
                          std::int32_t* nearest) {
@@ -88,7 +87,8 @@ inline void find_nearest(const float* points, Index number, const float* samples
   }
 }
 
-// For each sample the point of the contour that is nearest and points its way; there is one.
+// For each sample, the nearest point of the contour of similar direction; at least one point
+// exists.
 inline void match_outline(const Outline& outline, const Contour& contour, const Index* use,
                           Index used, Index* nearest) {
   constexpr float turn = static_cast<float>(outline_turn);
@@ -113,7 +113,7 @@ inline void match_outline(const Outline& outline, const Contour& contour, const 
   for (Index m = 0; m < count; ++m) nearest[m] = use[found[m]];
 }
 
-// Adds the residuals of the pose in a view, returns its energy.
+// Adds the residuals of the pose in a view, and returns its energy.
 HMT_WIDE inline double add_term(const PoseView& view, const CoverageInputs& inputs,
                                 const Sums& sums) {
   const Weighting& term = inputs.term;

@@ -3,9 +3,9 @@
 //     E(x) = w / V sum_i f_s(i) rho((D(u_i(x)) - z_i(x)) / sigma_i)
 //     sigma_i^2 = sigma^2 + (growth D^2)^2 + (noise_i / cos a_i)^2
 //
-// over the V visible points i of the flesh: on every ring the two on either side of the part that
-// faces the camera. D is the depth image, z_i the depth of the point, a_i the angle between its
-// normal and its ray, f_s the factor of segment s.
+// over the V visible points i of the flesh: on every ring, two points to either side of the place
+// that faces the camera. D is the depth image, z_i the depth of the point, a_i the angle between
+// its normal and its ray, f_s the factor of segment s.
 #pragma once
 
 #include "../elementary.h"
@@ -14,25 +14,25 @@
 
 namespace hmt {
 
-// Angle around a ring between the part that faces the camera and a point, rad.
+// Angle around a ring between the place that faces the camera and a point, rad.
 inline constexpr double aside = pi / 4.0;
 inline const double aside_cosine = elementary::cos(aside), aside_sine = elementary::sin(aside);
-// Points whose normal is further from the ray than this are not compared, as a cosine.
+// Minimum cosine between the normal and the ray of a point that is compared.
 inline constexpr double least_cosine = 0.3;
-// Neighbouring depths that differ by more, as a share of the depth, lie on two surfaces.
+// Relative difference above which neighbouring depths belong to two surfaces.
 inline constexpr double depth_jump = 0.03;
 
 struct DepthInputs {
   Weighting term;
-  ImageMap depths;  // m, 0 where nothing was measured
+  ImageMap depths;  // m, 0 if not measured
 
   void check() const {
     if (term.weight > 0.0) expect(depths.values.size() > 0, "depths.values", "a channel");
   }
 };
 
-// Depth at a pixel and its derivatives; 0 where nothing was measured. Between four depths of one
-// surface it is bilinear, else that of the nearest pixel.
+// Depth at a pixel and its derivatives; 0 if not measured. Four depths of one surface are
+// interpolated bilinearly; otherwise the nearest pixel is used.
 inline Sample sample_depth(const ImageMap& map, double u, double v) {
   const Index h = map.values.size(1), w = map.values.size(2);
   const double x = u - double(map.left), y = v - double(map.top);
@@ -52,8 +52,8 @@ inline Sample sample_depth(const ImageMap& map, double u, double v) {
   return {upper + (lower - upper) * dv, (b - a) * (1.0 - dv) + (q - p) * dv, lower - upper};
 }
 
-// Fills in the points of the pose in a view that face the camera, two on each ring; their noise
-// becomes that along the ray.
+// Sets the points that face the camera, two on each ring, of the pose in a view; their noise
+// becomes the noise along the ray.
 inline void trace_front(const PoseView& view, const Contour& front) {
   const Index n = view.rings.count();
   const double c = aside_cosine, s = aside_sine;
@@ -81,7 +81,7 @@ inline void trace_front(const PoseView& view, const Contour& front) {
   }
 }
 
-// Adds the residuals of the pose in a view, returns its energy.
+// Adds the residuals of the pose in a view, and returns its energy.
 HMT_WIDE inline double add_term(const PoseView& view, const DepthInputs& inputs, const Sums& sums) {
   const Weighting& term = inputs.term;
   const Contour& front = view.front;

@@ -26,20 +26,20 @@ struct EdgeInputs {
   }
 };
 
-// The orientation that a normal is nearest to, of angle k pi / 4.
+// The orientation nearest to a normal, of angle k pi / 4.
 inline std::int32_t orientation(double x, double y) {
   const std::int32_t diagonal = x * y > 0.0 ? 1 : 3;
   const std::int32_t steep = std::abs(x) <= half_bin * std::abs(y) ? 2 : diagonal;
   return std::abs(y) <= half_bin * std::abs(x) ? 0 : steep;
 }
 
-// Reads the four pixels around each point that is seen, of the map of its orientation.
+// Reads the four pixels around each visible point from the map of its orientation.
 inline void read_cells(const ImageMap& map, const Contour& contour, std::int32_t* cells,
                        const std::array<double*, 4>& corners) {
   const std::int32_t h = map.values.size(1), w = map.values.size(2);
 #pragma omp simd
   for (Index i = 0; i < contour.count; ++i) {
-    // What is no number counts as 0.
+    // NaN counts as 0.
     const double x = most(0.0, inside(contour.u[i] - double(map.left), w));
     const double y = most(0.0, inside(contour.v[i] - double(map.top), h));
     const auto column = static_cast<std::int32_t>(x), row = static_cast<std::int32_t>(y);
@@ -56,7 +56,7 @@ inline void read_cells(const ImageMap& map, const Contour& contour, std::int32_t
   }
 }
 
-// Adds the residuals of the pose in a view, returns its energy.
+// Adds the residuals of the pose in a view, and returns its energy.
 HMT_WIDE inline double add_term(const PoseView& view, const EdgeInputs& inputs, const Sums& sums) {
   const Weighting& term = inputs.term;
   const Contour& contour = view.contour;

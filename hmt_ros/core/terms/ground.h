@@ -10,18 +10,18 @@
 
 namespace hmt {
 
-// What does not depend on the pose.
+// Inputs that do not depend on the pose.
 struct GroundConstants {
   Mask dof_is_rotation;            // (d,)
   Array<const bool, 2> moves;      // (S, d) whether a degree of freedom moves a segment
   Numbers weights;                 // (2,) of the terms: upright, floor; 0: off
   Numbers up;                      // (3,) against gravity
-  double height;                   // of the camera over the floor, m
-  Places upright;                  // (U,) segments that are upright
-  Tables axes;                     // (U, 3, 3) their axes: to the side, ahead, up
-  Table lean;                      // (U, 3) deviations of gravity along these, rad
-  Places soles;                    // (P,) segments of the points of the soles
-  Table local;                     // (P, 3) their places there, m
+  double height;                   // height of the camera above the floor, m
+  Places upright;                  // (U,) segments with a prior of being upright
+  Tables axes;                     // (U, 3, 3) axes of these segments: to the side, ahead, up
+  Table lean;                      // (U, 3) deviations of gravity along these axes, rad
+  Places soles;                    // (P,) segments that carry the sole points
+  Table local;                     // (P, 3) local positions of the sole points, m
   double per_floor;                // 1 / deviation of the height of the floor, 1/m
   double lean_tails, floor_tails;  // degrees of freedom nu of rho
 
@@ -41,7 +41,7 @@ struct GroundConstants {
 
 struct Student {
   double value;
-  double factor;  // times r: the derivative; itself the curvature as in reweighted least squares
+  double factor;  // derivative over r; the curvature in reweighted least squares
 };
 
 inline Student student(double squared, double tails, double dimension) {
@@ -121,7 +121,7 @@ inline double add_floor(const GroundConstants& ground, const Tables& columns, co
   return total;
 }
 
-// Energy of one pose; adds its gradient (d,) and Hessian (d, d), where wanted.
+// Energy of one pose; adds its gradient (d,) and Hessian (d, d) if wanted.
 double add_ground_energy(const GroundConstants& ground, const Tables& columns, const Table& origins,
                          const Table& axes, const Table& dof_origins, bool wanted,
                          const Vector& gradient, const Matrix& hessian);

@@ -4,8 +4,8 @@
 //     E_g,e(x) = w_g sum_k f_s(k) rho(k, e)
 //
 // Given an exchange of sides, the energies of groups add; over the exchanges, likelihoods add. The
-// energy of the whole pose by a mixture over depths is added to those of the groups. s(k) is the
-// segment of keypoint k as it is called, however it is exchanged.
+// energy of the whole pose under a mixture over depths is added to the energies of the groups. s(k)
+// is the segment of keypoint k without exchange.
 #pragma once
 
 #include "../camera.h"
@@ -15,18 +15,18 @@
 
 namespace hmt {
 
-// A joint behind the camera errs by this much, in standard deviations.
+// Error of a joint behind the camera, in standard deviations.
 inline constexpr double error_behind = 1e3;
 // A landmark whose weight is below this adds nothing to the derivatives.
 inline constexpr double least_share = 1e-6;
 
-// Keypoints (P,), each with its landmark, and its landmark if sides are exchanged.
+// Keypoints (P,), each with its landmark without and with exchanged sides.
 struct Points {
-  Array<const Index, 2> segments;  // (P, 2) that carry the landmarks
+  Array<const Index, 2> segments;  // (P, 2) segments that carry the landmarks
   Tables offsets;                  // (P, 2, 3) in the frames of the segments, m
   Table pixels;                    // (P, 2)
   Tables whiteners;                // (P, 2, 2) W, W' W is the precision
-  Places groups;                   // (P,) that are exchanged together
+  Places groups;                   // (P,) group of keypoints exchanged together
 
   Index size() const { return groups.size(); }
   void check() const {
@@ -40,14 +40,14 @@ struct Points {
 
 // Depths of joints (J,) behind the middle of the hips, a mixture of C components.
 struct Lifted {
-  Places segments;      // (J,) that carry the joints
+  Places segments;      // (J,) segments that carry the joints
   Table offsets;        // (J, 3) in the frames of the segments, m
   Numbers middle;       // (3,) middle of the hips in the frame of the root, m
   Numbers ray;          // (3,) line of sight, unit vector
-  Numbers log_weights;  // (C,) with the normalisers of the components
-  Tables depths;        // (2, C, J) along the ray, m, as the sides are called and exchanged
+  Numbers log_weights;  // (C,) including the normalisers of the components
+  Tables depths;        // (2, C, J) along the ray, m, without and with exchanged sides
   Tables precisions;    // (2, C, J) square roots, 1/m
-  Places readings;      // (E,) 0 or 1: how an exchange of sides reads the mixture
+  Places readings;      // (E,) 0 or 1: first index of `depths` for each exchange of sides
   double weight;        // factor on the energy; 0 without a mixture
   double scale;         // of the kernel, in standard deviations
 
@@ -71,9 +71,9 @@ struct KeypointInputs {
   Lens lens;
   double scale;                     // of the kernel, in standard deviations
   Numbers weights;                  // (G,) factors on the energies of the groups
-  Numbers factors;                  // (S,) on those of keypoints of each segment; none: 1
+  Numbers factors;                  // (S,) factors for keypoints of each segment; none: 1
   Array<const Index, 2> exchanged;  // (E, G) 1 where an exchange exchanges a group
-  Table log_priors;                 // (R, E) of the exchanges, a row a problem or one for all
+  Table log_priors;                 // (R, E) of the exchanges, one row per problem or one for all
 
   Index exchanges() const { return exchanged.size(); }
   Index groups() const { return weights.size(); }
@@ -93,14 +93,14 @@ struct KeypointInputs {
   }
   // Factor on the energy of keypoint k.
   double factor(Index k) const { return factor_of(factors, points.segments(k, 0)); }
-  // Frames (N, S, 3, 3), (N, S, 3) of the segments must be there for all poses.
+  // Checks that frames (N, S, 3, 3), (N, S, 3) of the segments exist for all poses.
   void check_frames(const Array<const double, 4>& columns, const Tables& origins) const {
     expect_shape("columns", columns, {-1, tree.segments(), 3, 3});
     expect_shape("origins", origins, {columns.size(), tree.segments(), 3});
   }
 };
 
-// Room for one pose after the other.
+// Working space, reused for all poses.
 struct KeypointRoom {
   explicit KeypointRoom(const KeypointInputs& inputs)
       : posterior(inputs.exchanges()),
@@ -115,14 +115,14 @@ struct KeypointRoom {
         dof_origins(inputs.tree.dimension(), 3) {}
 
   Scratch<double, 1> posterior;         // log probabilities of the exchanges
-  Scratch<double, 2> energies;          // of the groups, as they are called and exchanged
+  Scratch<double, 2> energies;          // of the groups, without and with exchange
   Scratch<double, 2> shares;            // probabilities that groups are exchanged or not
-  Scratch<double, 1> behind;            // how far the joints are behind the middle of the hips
-  Scratch<double, 2> by_joint;          // any numbers of the joints, and 0 up to whole lanes
+  Scratch<double, 1> behind;            // depths of the joints behind the middle of the hips
+  Scratch<double, 2> by_joint;          // numbers of the joints, padded with 0 to whole lanes
   Scratch<double, 2> places;            // the middle of the hips and the joints
-  Scratch<double, 2> responsibilities;  // of the components, by the readings
+  Scratch<double, 2> responsibilities;  // of the components, without and with exchange
   Scratch<SegmentSums, 1> segments;
-  Scratch<double, 2> axes, dof_origins;  // where the middle of the hips rests
+  Scratch<double, 2> axes, dof_origins;  // with the middle of the hips at rest
 
   // Sums over the segments, zero.
   Sums no_sums() const {
@@ -135,7 +135,7 @@ struct KeypointRoom {
 // The landmark of a keypoint at a pose.
 struct Landmark {
   double place[3], pixel[2], projection[6];
-  bool shown;        // it has a pixel
+  bool shown;        // whether it has a pixel
   double errors[2];  // of the keypoint, whitened
 
   Landmark(const KeypointInputs& inputs, Index k, Index exchanged, const Tables& columns,
@@ -164,7 +164,7 @@ struct Landmark {
   }
 };
 
-// Fills the energies (G, 2) of the groups at one pose, as they are called and exchanged.
+// Fills the energies (G, 2) of the groups at one pose, without and with exchange.
 inline void group_energies(const KeypointInputs& inputs, const Tables& columns,
                            const Table& origins, const Matrix& energies) {
   energies.fill(0.0);
@@ -181,8 +181,8 @@ inline void group_energies(const KeypointInputs& inputs, const Tables& columns,
   }
 }
 
-// Minus the log densities (2,) of the mixture at one pose, as the sides are called and exchanged;
-// fills its part of the room.
+// Minus the log densities (2,) of the mixture at one pose, without and with exchanged sides; fills
+// its part of the room.
 inline void lifted_energies(const Lifted& lifted, const Tables& columns, const Table& origins,
                             const KeypointRoom& room, double* energies) {
   const Index joints = lifted.joints();
@@ -218,10 +218,11 @@ inline void lifted_energies(const Lifted& lifted, const Tables& columns, const T
   }
 }
 
-// Adds the derivatives of the mixture at one pose, with the probabilities (2,) of its readings.
+// Adds the derivatives of the mixture at one pose, with the probabilities (2,) that sides are not
+// exchanged, and exchanged.
 //
-// A joint moves against the middle of the hips, so that variables that move the hips count as if
-// they turned about them and shifted nothing.
+// Depths are relative to the middle of the hips. So rotations of the root act about this middle,
+// and its translations have no effect.
 inline void add_lifted(const KeypointInputs& inputs, const double* readings, const Table& axes,
                        const Table& dof_origins, const Vector& gradient, const Matrix& hessian,
                        const KeypointRoom& room) {
@@ -262,7 +263,7 @@ inline void add_lifted(const KeypointInputs& inputs, const double* readings, con
   assemble_pose(tree, room.axes, room.dof_origins, sums.segments, gradient, hessian);
 }
 
-// Log probabilities (E,) of exchanges at one pose, from those before (E,); returns minus the log of
+// Log probabilities (E,) of exchanges at one pose, from log priors (E,); returns minus the log of
 // the sum of their likelihoods.
 inline double weigh_exchanges(const KeypointInputs& inputs, const Numbers& log_prior,
                               const Tables& columns, const Table& origins, const KeypointRoom& room,
@@ -289,7 +290,7 @@ inline double weigh_exchanges(const KeypointInputs& inputs, const Numbers& log_p
   return -total;
 }
 
-// Log probabilities (N, E) of exchanges at N poses, with a row of those before (N, E) for each.
+// Log probabilities (N, E) of exchanges at N poses, from log priors (N, E).
 inline void exchange_posteriors(const KeypointInputs& inputs, const Table& log_priors,
                                 const Array<const double, 4>& columns, const Tables& origins,
                                 const Matrix& result) {
@@ -303,8 +304,8 @@ inline void exchange_posteriors(const KeypointInputs& inputs, const Table& log_p
   }
 }
 
-// Calls `visit(k, exchanged, landmark)` for all keypoints at one pose, in the exchange that is
-// likeliest there by the first row of priors.
+// Calls `visit(k, exchanged, landmark)` for all keypoints at one pose, with its most likely
+// exchange by the first row of priors.
 template <class Visit>
 void visit_keypoints(const KeypointInputs& inputs, const Tables& columns, const Table& origins,
                      const KeypointRoom& room, const Visit& visit) {
@@ -316,8 +317,8 @@ void visit_keypoints(const KeypointInputs& inputs, const Tables& columns, const 
   }
 }
 
-// Whitened errors (N, P, 2) of the keypoints at N poses, in the exchange that is likeliest there;
-// NaN behind the camera.
+// Whitened errors (N, P, 2) of the keypoints at N poses, with the most likely exchange of each
+// pose; NaN behind the camera.
 inline void keypoint_errors(const KeypointInputs& inputs, const Array<const double, 4>& columns,
                             const Tables& origins, const Tensor& errors) {
   inputs.check_frames(columns, origins);
@@ -332,8 +333,8 @@ inline void keypoint_errors(const KeypointInputs& inputs, const Array<const doub
   }
 }
 
-// Lists (N, 1 + 2 P, recorded) the residuals of keypoints at N poses, as `Sums` does; their joints
-// (P, 2) of the skeleton, as called and exchanged, stand where segments do.
+// Lists (N, 1 + 2 P, recorded) the residuals of keypoints at N poses, as `Sums` does; joints (P, 2)
+// of the skeleton, without and with exchange, replace the segments.
 inline void record_keypoints(const KeypointInputs& inputs, const Array<const Index, 2>& joints,
                              const Array<const double, 4>& columns, const Tables& origins,
                              const Tensor& residuals) {
@@ -354,9 +355,9 @@ inline void record_keypoints(const KeypointInputs& inputs, const Array<const Ind
   }
 }
 
-// The energy of one pose with log probabilities (E,) of the exchanges before. Where derivatives are
-// wanted it adds residuals of keypoints to the sums, and those of depths to gradient (d,) and
-// Hessian (d, d). Axes and origins (d, 3) are of the degrees of freedom.
+// The energy of one pose with log priors (E,) of the exchanges. If derivatives are wanted,
+// residuals of keypoints are added to the sums, and those of depths to gradient (d,) and Hessian
+// (d, d). Axes and origins (d, 3) belong to the degrees of freedom.
 HMT_WIDE inline double add_keypoints(const KeypointInputs& inputs, const Numbers& log_prior,
                                      const Tables& columns, const Table& origins, const Table& axes,
                                      const Table& dof_origins, const Sums& sums,

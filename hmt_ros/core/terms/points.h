@@ -1,4 +1,4 @@
-// Points of the body that should be where they were seen, or where they are known to be.
+// Energies of points of the body with observed or known positions.
 #pragma once
 
 #include "../kinematics.h"
@@ -6,8 +6,8 @@
 
 namespace hmt {
 
-// Fills the energies (N,) 1/2 sum |A (p - t)|^2 of points p that segments (P,) carry at places
-// (P, 3), for targets t (N, P, 3) and A of R rows (N, P, R, 3), their gradients (N, d) and
+// Fills the energies (N,) 1/2 sum |A (p - t)|^2 of points p at local positions (P, 3) on segments
+// (P,), for targets t (N, P, 3) and A of R rows (N, P, R, 3), their gradients (N, d) and
 // Gauss-Newton Hessians (N, d, d).
 inline void evaluate_points(const Tree& tree, const Array<const double, 4>& columns,
                             const Tables& origins, const Tables& axes, const Tables& dof_origins,

@@ -1,9 +1,9 @@
-// Soft prior against parts of the body that run through each other (KJS 2).
+// Soft prior against parts of the body that intersect (KJS 2).
 //
 //     E(x) = sum_pairs 1/2 ([r_p + r_q - |p - q| - tolerance]+ / sigma)^2
 //
-// p and q are the points of the axes of two parts where they are nearest, r_p and r_q how far the
-// parts reach from these along the line between; see hmt_ros/body/self_intersection.py.
+// p and q are the nearest points of the axes of two parts, r_p and r_q the extents of the parts
+// from p and q along the connecting line; see hmt_ros/body/self_intersection.py.
 #pragma once
 
 #include "../kinematics.h"
@@ -13,11 +13,11 @@ namespace hmt {
 
 // Parts as capsules with elliptic cross-sections.
 struct Capsules {
-  Places segments;  // (B,) that carry them
-  Table centres;    // (B, 3) of the axes in the segments' frames, m
+  Places segments;  // (B,) segments that carry the parts
+  Table centres;    // (B, 3) centres of the axes in the segments' frames, m
   Numbers halves;   // (B,) half lengths of the axes, m
   Table radii;      // (B, 3) along x, y and, for the caps, z, m
-  Numbers reaches;  // (B,) from the middle to the farthest point, m
+  Numbers reaches;  // (B,) distances from the centre to the farthest point, m
 
   Index size() const { return segments.size(); }
   void check() const {
@@ -33,7 +33,7 @@ struct Overlaps {
   Places first, second;        // (Q,) the pairs that may overlap
   Mask dof_is_rotation;        // (d,)
   Array<const bool, 2> moves;  // (S, d) whether a degree of freedom moves a segment
-  double sigma;                // overlap with energy 1/2, m; inf: none costs anything
+  double sigma;                // overlap with energy 1/2, m; inf: no cost
   double tolerance;            // overlap without cost, m
 
   void check() const {
@@ -45,7 +45,7 @@ struct Overlaps {
   }
 };
 
-// Scratch space for the overlaps of one pose after the other.
+// Working space for overlaps, reused for all poses.
 struct OverlapRoom {
   explicit OverlapRoom(const Overlaps& overlaps)
       : centres(overlaps.parts.size(), 3), row(overlaps.dof_is_rotation.size()) {}
@@ -68,7 +68,7 @@ inline void place_centres(const Capsules& parts, const Tables& columns, const Ta
   }
 }
 
-// How far a part reaches from its axis along a unit vector.
+// Extent of a part from its axis along a unit vector.
 inline double width_along(const Capsules& parts, Index i, const Tables& columns, const double* d) {
   const double *column = columns[parts.segments[i]].data, *radii = parts.radii[i].data;
   double total = 0.0;
@@ -79,7 +79,7 @@ inline double width_along(const Capsules& parts, Index i, const Tables& columns,
 struct Overlap {
   double p[3], q[3];  // nearest points of the axes
   double d[3];        // direction from q to p
-  double depth;       // sum of the reaches less the distance, m
+  double depth;       // sum of the extents minus the distance, m
 };
 
 // Overlap of two parts. The axes are middle + s axis, s in [-1, 1].
@@ -117,7 +117,7 @@ inline bool far_apart(const Overlaps& overlaps, Index i, Index j, const Matrix& 
   return dot(away, away) > square(reaches[i] + reaches[j] - overlaps.tolerance);
 }
 
-// Fills the derivative (d,) of the overlap of parts on two segments, less the sign, over sigma.
+// Fills the derivative (d,) of the overlap of parts on two segments, without its sign, over sigma.
 inline void derive_overlap(const Overlaps& overlaps, const Overlap& found, Index first,
                            Index second, const Table& axes, const Table& dof_origins,
                            const Vector& row) {
@@ -149,8 +149,8 @@ inline void derive_overlap(const Overlaps& overlaps, const Overlap& found, Index
   }
 }
 
-// Adds the energy of one pose and, where wanted, its gradient (d,) and Gauss-Newton Hessian (d, d).
-// That an elliptic cross-section turns is left out of them.
+// Adds the energy of one pose and, if wanted, its gradient (d,) and Gauss-Newton Hessian (d, d).
+// The derivatives neglect rotations of elliptic cross-sections.
 HMT_WIDE inline void add_overlaps(const Overlaps& overlaps, const Tables& columns,
                                   const Table& origins, const Table& axes, const Table& dof_origins,
                                   bool wanted, double& value, const Vector& gradient,

@@ -16,7 +16,7 @@ struct Transition {
   void check() const { expect(variance > 0.0 && tails > 0.0, "variance", "positive numbers"); }
 };
 
-// Joints (N, J, 3) relative to the first of them, pose by pose along the last axis: (3 J, N).
+// Joints (N, J, 3) relative to the first joint, with poses on the last axis: (3 J, N).
 inline Scratch<double, 2> relative_coordinates(const Tables& joints) {
   const Index n = joints.size(), count = joints.size(1);
   Scratch<double, 2> result(3 * count, n);
@@ -27,7 +27,7 @@ inline Scratch<double, 2> relative_coordinates(const Tables& joints) {
   return result;
 }
 
-// Fills log t (N,) from column k of some coordinates to all others, equation (3).
+// Fills log t (N,) from column k of coordinates to all columns of others, equation (3).
 HMT_WIDE inline void fill_transitions(const Table& from, Index k, const Table& to, double scale,
                                       double tails, double* __restrict result) {
   const Index n = to.size(1);

@@ -1,4 +1,4 @@
-// The ways that persons face; equations in hmt_ros/tracking/classes.py.
+// Facing directions of persons; equations in hmt_ros/tracking/classes.py.
 #pragma once
 
 #include "../arrays.h"
@@ -15,12 +15,12 @@ inline Direction unit(Direction v) {
   return v;
 }
 
-// The joints (L,) of the trunk on its left, and those on its right.
+// The joints (L,) on the left and on the right side of the trunk.
 struct Trunk {
   Places left, right;
 };
 
-// To the left of a person with joints (J, 3).
+// The unit vector to the left of a person with joints (J, 3).
 inline Direction left_of(const Trunk& trunk, const Table& joints) {
   Direction left{}, right{};
   for (Index j : trunk.left) {
@@ -50,7 +50,7 @@ inline void point_left(const Trunk& trunk, const Tables& joints, const Matrix& r
   }
 }
 
-// How far the front of a person, left x up, points away from the camera: sine of the angle.
+// Sine of the angle by which the front of a person, left x up, points away from the camera.
 inline double facing_away(const Direction& left, const Table& joints, Index neck) {
   const double *pelvis = joints[0].data, *top = joints[neck].data;
   const Direction up = unit({top[0] - pelvis[0], top[1] - pelvis[1], top[2] - pelvis[2]});
@@ -58,8 +58,9 @@ inline double facing_away(const Direction& left, const Table& joints, Index neck
   return dot(left.data(), cross(up.data(), ray.data()).data());
 }
 
-// Fills whether persons with joints (N, J, 3) face another way than one with joints (J, 3): away
-// from it, or one faces the camera where the other turns its back, by more than `sideways` apart.
+// Fills whether persons with joints (N, J, 3) face another direction than one with joints (J, 3):
+// by more than 90 degrees, or one faces the camera and the other faces away, with sines that differ
+// by more than twice `sideways`.
 inline void face_back(const Trunk& trunk, const Tables& joints, const Table& reference, Index neck,
                       double sideways, const Array<bool, 1>& result) {
   expect_joints(trunk, joints);
@@ -76,31 +77,32 @@ inline void face_back(const Trunk& trunk, const Tables& joints, const Table& ref
   }
 }
 
-// Evidence for a facing direction, bounded as an image may show something else, equation (3).
+// Evidence for a facing direction, bounded because the image may be misleading, equation (3).
 inline double believed(double evidence, double valid) {
   const double yes = elementary::log(valid), no = elementary::log1p(-valid);
   return log_add_exp(yes + evidence, no) - log_add_exp(yes, no + evidence);
 }
 
-// What is known of the two ways.
+// State and parameters of the two facing directions.
 struct Ways {
-  Mask before;      // (K,) modes that face the other way than the heaviest
-  Mask back;        // (N,) hypotheses that do
-  double variance;  // of turns, rad^2
-  double log_odds;  // of the other way, by themselves
-  double price;     // of a change of ways, nats
+  Mask before;      // (K,) modes that face another direction than the heaviest
+  Mask back;        // (N,) hypotheses that face that other direction
+  double variance;  // variance of turns, rad^2
+  double log_odds;  // prior log odds of the other direction
+  double price;     // price of a change of direction, nats
   double valid;     // share of the images that show the facing direction
-  double most;      // log odds
+  double most;      // maximum log odds
 };
 
-// Weighs the ways, equations (1) and (2): fills log weights (N,) with the weights of the histories,
-// the log odds (N,) of the way that each faces, and what (6) adds to log t (K, N).
+// Weights the facing directions, equations (1) and (2): fills log weights (N,) with the
+// probabilities of the directions, the log odds (N,) of the direction of each hypothesis, and the
+// terms that (6) adds to log t (K, N).
 //
-// first, joints: of the predicted modes (K, J, 3) and of the hypotheses (N, J, 3)
+// first, joints: joints of the predicted modes (K, J, 3) and of the hypotheses (N, J, 3)
 // transitions: (K, N) log t
-// log_weights: (N,) of which only the ratios within a way are used
+// log_weights: (N,) only the ratios within a direction are used
 // evidence: (N,) energies of the image
-// followed: (N,) whether each has moved on from a mode
+// followed: (N,) whether each hypothesis continues a mode
 inline void weigh_ways(const Trunk& trunk, const Ways& ways, const Tables& first,
                        const Tables& joints, const Table& transitions, const Numbers& log_weights,
                        const Numbers& evidence, const Mask& followed, const Vector& result,
@@ -142,7 +144,7 @@ inline void weigh_ways(const Trunk& trunk, const Ways& ways, const Tables& first
   }
   if (any[0] && any[1]) log_odds += believed(best[0] - best[1], ways.valid);
   log_odds = between(log_odds, -ways.most, ways.most);
-  // If all modes went over, the track is as sure of this way as it was of the other one.
+  // If all hypotheses have turned, the track is as sure of this direction as it was of the other.
   if (!seen[0]) log_odds = std::abs(log_odds);
   for (Index i = 0; i < n; ++i) facing[i] = back[i] ? log_odds : -log_odds;
   result.copy_from(log_weights);

@@ -1,4 +1,4 @@
-// Gaussians around optima, of which some variables rest on limits; see
+// Gaussians around optima with some variables on limits; see
 // hmt_ros/tracking/posterior.py and laplace_approximation.py.
 #pragma once
 
@@ -7,9 +7,9 @@
 
 namespace hmt {
 
-// Fills the inverses S (K, d, d) of sums of Hessians (K, C, d, d), each with its share (C,), on the
-// free variables (K, d), and log |S| (K,); no numbers where a sum is not positive definite. A
-// variable that rests on a limit has the precision `resting`, and every one has `least` besides.
+// Fills the inverses S (K, d, d) of sums of Hessians (K, C, d, d), weighted by shares (C,), on the
+// free variables (K, d), and log |S| (K,); NaN if a sum is not positive definite. A variable on a
+// limit has the precision `resting`; all variables get the precision `least` in addition.
 inline void free_covariances(const Array<const double, 4>& hessians, const Numbers& shares,
                              const Array<const bool, 2>& free, double resting, double least,
                              const Tensor& covariances, const Vector& log_determinants) {
@@ -45,8 +45,8 @@ inline void free_covariances(const Array<const double, 4>& hessians, const Numbe
   }
 }
 
-// Fills where the likelihood alone is best (K, d), by parabolas around modes of the posterior:
-// x - S g, `most` standard deviations of the posterior away at most, and within limits.
+// Fills the optima (K, d) of the likelihood alone, by parabolas around modes of the posterior: x -
+// S g, within limits and at most `most_deviations` standard deviations of the posterior away.
 //
 // poses: (K, d) modes
 // gradient: (K, d) of the energy of the likelihood
@@ -75,7 +75,8 @@ inline void shift_modes(const Table& poses, const Table& gradient, const Array<c
   }
 }
 
-// Fills how many variables each of C cues determines, tr(S H_c), in the mean over K modes (C,).
+// Fills the effective number (C,) of variables that each cue determines, tr(S H_c), averaged over K
+// modes.
 //
 // weights, covariances: (K,), (K, d, d) of the modes
 // hessians: (K, C, d, d)

@@ -27,12 +27,13 @@ inline void bin_colours(const Picture& image, Index count, const Array<std::uint
   }
 }
 
-// counts (R, C): how many pixels of each region (h, w), 0 to R - 1, have each bin of colours.
+// counts (R, C): number of pixels of each region (h, w), 0 to R - 1, in each bin of colours.
 inline void count_colours(const Array<const std::uint16_t, 2>& bins, const Bytes& regions,
                           const Array<Index, 2>& counts) {
   expect_shape("regions", regions, {bins.size(0), bins.size(1)});
   const Index colours = counts.size(1), pixels = bins.count();
-  // Neighbours, of the same colour, count in turn: one need not wait for the other.
+  // Neighbours often have the same colour, so two counters take turns and do not wait for each
+  // other.
   std::vector<std::int32_t> own(2 * counts.count(), 0);
   for (Index i = 0; i < pixels; ++i) {
     const Index bin = bins.data[i], region = regions.data[i];

@@ -1,7 +1,7 @@
 // Distances to the nearest edges of some orientations; see hmt_ros/image/terms/edges.py.
 //
-// They are chamfer distances of a 3 x 3 mask [Borgefors, CVGIP 1986], as `cv2.distanceTransform`
-// has them, of all orientations at once.
+// They are chamfer distances of a 3 x 3 mask [Borgefors, CVGIP 1986], as in
+// `cv2.distanceTransform`, for all orientations at once.
 #pragma once
 
 #include "../terms/edges.h"
@@ -10,21 +10,21 @@
 
 namespace hmt {
 
-// Lengths of steps to the side and across, and the longest way: whole numbers of 2^-16 px.
+// Lengths of straight and diagonal steps, and maximum length of a path, in units of 2^-16 px.
 inline constexpr std::int32_t beside_step = 62587, across_step = 89738, longest_way = 1 << 29;
 inline constexpr float per_pixel = 1.0f / 65536.0f;
-// Where there is no edge of an orientation, px.
+// Distance if there is no edge of an orientation, px.
 inline constexpr float no_edge = 1000.0f;
-// Edges up to three quarters of a bin beside a direction are of its orientation: tan(3 pi / 16).
+// Edges within three quarters of a bin of a direction have its orientation: tan(3 pi / 16).
 inline constexpr double widest_bin = 0.6681786379192989;
 
-// A way for each orientation.
+// The length of a path for each orientation.
 using PixelLanes [[gnu::vector_size(orientations * sizeof(std::int32_t))]] = std::int32_t;
 using Pixels [[gnu::vector_size(orientations * sizeof(float))]] = float;
 
 HMT_INLINE PixelLanes shorter(PixelLanes a, PixelLanes b) { return a < b ? a : b; }
 
-// 0 for each orientation that the normal (x, y) of an edge is of, the longest way for others.
+// 0 for each orientation of an edge with the normal (x, y), the maximum length for others.
 inline PixelLanes ways_of(int x, int y) {
   const auto way = [](int along, int aside) {
     return std::abs(aside) <= widest_bin * std::abs(along) ? 0 : longest_way;
@@ -32,7 +32,7 @@ inline PixelLanes ways_of(int x, int y) {
   return PixelLanes{way(x, y), way(x + y, y - x), way(y, x), way(y - x, x + y)};
 }
 
-// The ways (h, w) from edges, whose own are `ways` at first; there is a border of a pixel.
+// Lengths of paths (h, w) from edges, from initial `ways` at the edges; with a border of a pixel.
 HMT_WIDE inline void spread(PixelLanes* ways, Index h, Index w) {
   const Index stride = w + 2;
   const PixelLanes beside = PixelLanes{} + beside_step, across = PixelLanes{} + across_step;
@@ -58,9 +58,9 @@ HMT_WIDE inline void spread(PixelLanes* ways, Index h, Index w) {
   }
 }
 
-// distances (C, h, w), px, to the nearest edge (h, w) that is near, and that nobody else hides,
-// whose normal (dx, dy) falls into each orientation; `hidden` where somebody else is. Without rows:
-// all is near, there is nobody else.
+// distances (C, h, w), px, to the nearest edge (h, w) of each orientation, by its normal (dx, dy).
+// Only edges marked `near` and not `hidden` by another person are used; a mask without rows is not
+// applied.
 inline void edge_distances(const Bytes& edges, const Derivative& dx, const Derivative& dy,
                            const Bytes& near, const Bytes& others, double hidden,
                            const Array<float, 3>& distances) {

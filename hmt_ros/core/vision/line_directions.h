@@ -1,4 +1,4 @@
-// Straight lines before frames of directions; see hmt_ros/image/vertical_lines.py.
+// Likelihoods of straight lines for frames of directions; see hmt_ros/image/vertical_lines.py.
 #pragma once
 
 #include <numbers>
@@ -9,9 +9,9 @@
 
 namespace hmt {
 
-// Deviations from which on the density of an angle is nothing beside 1.
+// Number of deviations beyond which the density of an angle is negligible compared to 1.
 inline constexpr double farthest_angle = 9.0;
-// Square of the sine of the least angle between a direction and the ray to a line that counts.
+// Squared sine of the minimum angle between a direction and the ray to a line that is used.
 inline constexpr double least_across = 1e-4;
 
 // N lines, a vector for each coordinate: normals of planes through the camera, and rays (3, N).
@@ -54,8 +54,8 @@ HMT_WIDE inline void fill_densities(const double* deviations, double* angles, In
   }
 }
 
-// Densities (D, N), over uniform, of the angles of lines with deviations (N,) if they ran along
-// directions (D, 3).
+// Densities (D, N), relative to uniform, of the angles of lines with deviations (N,) if the lines
+// had the directions (D, 3).
 inline void rate_lines(const Table& directions, const Table& normals, const Table& middles,
                        const Numbers& deviations, const Matrix& result) {
   const Index n = deviations.size();
@@ -82,12 +82,12 @@ inline void rate_lines(const Table& directions, const Table& normals, const Tabl
   }
 }
 
-// Log likelihoods (F, A) of frames, of a vertical and A pairs of others of D directions: a share of
-// the lines follows each, by the densities (D, N), and the rest is anywhere.
+// Log likelihoods (F, A) of frames, each of a vertical and one of A pairs of other directions among
+// D: a share of the lines follows each direction, with densities (D, N), and the rest is uniform.
 inline void rate_frames(const Table& densities, const Places& vertical,
                         const Array<const Index, 2>& first, const Array<const Index, 2>& second,
                         double share, const Matrix& result) {
-  constexpr Index together = 128;  // lines whose product is a number
+  constexpr Index together = 128;  // number of lines whose product stays finite
   const Index d = densities.size(), n = densities.size(1), frames = vertical.size();
   const Index padded = (n + group_size - 1) / group_size * group_size;
   expect_range("vertical", vertical, 0, d);
@@ -96,7 +96,7 @@ inline void rate_frames(const Table& densities, const Places& vertical,
   expect_shape("first", first, {frames, -1});
   expect_shape("second", second, {frames, first.size(1)});
   expect_shape("result", result, {frames, first.size(1)});
-  // Of a third of the share each, and of lines that are not there 1.
+  // Each direction has a third of the share; missing lines have a likelihood of 1.
   Scratch<double, 2> parts(d, padded);
   for (Index k = 0; k < d; ++k) {
     for (Index i = 0; i < padded; ++i) parts(k, i) = share / 3.0 * (i < n ? densities(k, i) : 1.0);

@@ -8,13 +8,14 @@
 
 namespace hmt {
 
-// Belief in a sample of the outline beyond which, this many px away, the person may go on.
+// Belief in a sample of the outline if the person may continue beyond it; distance of this test,
+// px.
 inline constexpr double unsure_belief = 0.3, belief_distance = 4.0;
-// Least length of a gradient that has a direction.
+// Minimum length of a gradient that has a direction.
 inline constexpr double least_gradient = 1e-3;
 
-// Weights of the pixels around a point in the gradient of a mask that is blurred by a Gaussian:
-// that by column; by row they are transposed. Whole numbers, so that sums have no order.
+// Weights of the pixels around a point in the gradient of a mask blurred by a Gaussian, by column;
+// by row they are transposed. They are integers, so that sums do not depend on the order.
 struct GradientWeights {
   static constexpr double sigma = 2.0, scale = 0x1p24;
   static constexpr Index reach = 9, width = 2 * reach + 1;
@@ -61,7 +62,7 @@ HMT_WIDE inline std::array<double, 2> mask_gradient(const Bytes& mask,
   return {x / GradientWeights::scale, y / GradientWeights::scale};
 }
 
-// A pixel of a mask that has rows; beyond its sides it is the next one inside.
+// A pixel of a mask that is not empty; beyond its sides, the nearest pixel inside.
 inline bool has_pixel(const Bytes& mask, double column, double row) {
   const auto at = [](double x, Index size) {
     return static_cast<Index>(between(std::nearbyint(x), 0.0, double(size - 1)));
@@ -69,9 +70,10 @@ inline bool has_pixel(const Bytes& mask, double column, double row) {
   return mask.size() > 0 && mask(at(row, mask.size()), at(column, mask.size(1)));
 }
 
-// About `count` samples, evenly along all outlines of a mask (h, w), into the rows of an outline;
-// returns how many. An outline is a part of the pixels (P, 2), column and row, up to one of `ends`,
-// closed. Pixels are relative to (left, top). `unsure` and `others` have no rows where nobody is.
+// Fills the rows of an outline with about `count` samples, evenly along all outlines of a mask (h,
+// w); returns their number. An outline is a closed part of the pixels (P, 2), column and row, up to
+// one of `ends`. Pixels are relative to (left, top). `unsure` and `others` have no rows if they are
+// not used.
 inline Index sample_outline(const Array<const std::int32_t, 2>& pixels, const Places& ends,
                             const Bytes& mask, const Bytes& unsure, const Bytes& others,
                             Index count, Index left, Index top, const Matrix& places,
@@ -128,7 +130,7 @@ inline Index sample_outline(const Array<const std::int32_t, 2>& pixels, const Pl
       const double size = std::sqrt(gradient[0] * gradient[0] + gradient[1] * gradient[1]);
       if (size <= least_gradient) continue;
       expect(used < most, "places", "room for all samples");
-      // Out of the silhouette is against the gradient.
+      // The outward direction is opposite to the gradient.
       const double x = -gradient[0] / size, y = -gradient[1] / size;
       const double column = place[0] + belief_distance * x, row = place[1] + belief_distance * y;
       beliefs[used] = has_pixel(others, column, row)   ? 0.0

@@ -1,15 +1,14 @@
 """The person in a mask, and points at equal distances along the outline (BME 3).
 
-A mask may show more than the person: other people, ghosts, pieces torn off by background
+A mask may show more than the person: other people, ghosts, or pieces separated by background
 subtraction. One blob is taken as the person, together with the pieces that belong to it; other
-blobs are counted so that callers can report them. The sides at which the border of the image cuts
-the person are marked.
+blobs are counted so that callers can report them. The result also says at which sides the border of
+the image cuts the person.
 
 `centred_view` is the silhouette in a camera without distortion that looks straight at the person.
-
-Towards the border of an image, most of all with a wide lens, a person is stretched and leans. Seen
-along the optical axis, one posture looks the same wherever it is, as its target does
-(`hmt_ros.experts.pose_encoding`).
+Near the border of an image, especially with a wide-angle lens, a person appears stretched and
+leaning. Seen along the optical axis, a posture looks the same at all places in the image, and its
+target (`hmt_ros.experts.pose_encoding`) is the same, too.
 """
 
 from __future__ import annotations
@@ -33,18 +32,18 @@ SMALLEST = 60  # minimum area of a person, px
 # fills.
 LONGEST = 5.0
 FULLEST = 0.93
-# Maximum area of a piece of the person over the person's area; maximum gap over the height.
+# Maximum area of a piece relative to the main blob; maximum gap relative to its longer side.
 PIECE = 0.35
 GAP = 0.12
 NOTABLE = 0.02  # share of the person's area above which a left-out blob is reported
 SMALLEST_HOLE = 0.004  # share of the area below which a hole is noise
-SMOOTHING = 5  # points of an outline that are averaged, which removes the steps of the raster
+SMOOTHING = 5  # number of averaged points of an outline, to remove the steps of the pixel grid
 SIDES = ('left', 'top', 'right', 'bottom')
 
-SIDE = 192  # px, of the view
-FILLED = 0.8  # share of the view that the longer side of the person fills, roughly
+SIDE = 192  # side length of the view, px
+FILLED = 0.8  # approximate ratio of the longer side of the person to the side of the view
 UPRIGHT = np.eye(3)
-STRAIGHT = np.radians(2.0)  # angle to the axis below which a rotation is below a pixel
+STRAIGHT = np.radians(2.0)  # angle to the optical axis below which the view is not rotated
 
 
 class NoSilhouetteError(ValueError):
@@ -58,9 +57,9 @@ class PersonBlob:
     Attributes:
         mask: (h, w) uint8, 1 inside; cropped to the bounding box.
         left, top: Corner of the bounding box in the image, px.
-        cut: Whether the border of the image cuts the person: left, top, right, bottom. Where it
-            does, the edge of the box is not that of the person.
-        left_out: Number of other notable blobs.
+        cut: Whether the border of the image cuts the person: left, top, right, bottom. At such a
+            side the person extends beyond the box.
+        left_out: Number of other blobs that are large enough to report.
     """
 
     mask: Bytes
@@ -77,7 +76,7 @@ class PersonBlob:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Remarks for a user: blobs that were left out, sides at which the person is cut."""
+        """Remarks for a user: other blobs, and sides at which the person is cut."""
         result = []
         if self.left_out:
             result.append(
@@ -126,7 +125,7 @@ def person_blob(mask: ArrayLike) -> PersonBlob:
 
 
 def _belonging(stats: NDArray[np.int32]) -> tuple[Mask, int]:
-    """Mask (n,) of the blobs that belong to the person, and the number of other notable ones."""
+    """Mask (n,) of the blobs that belong to the person, and the number of other large blobs."""
     area = stats[:, cv2.CC_STAT_AREA].astype(float)
     width, height = (stats[:, i].astype(float) for i in (cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT))
     like = np.maximum(width / height, height / width) <= LONGEST
@@ -145,7 +144,7 @@ def _belonging(stats: NDArray[np.int32]) -> tuple[Mask, int]:
 def sample_contour(mask: Bytes, count: int = 100) -> tuple[Array, Array]:
     """Points at equal distances along the outlines of a mask, and the directions of the outlines.
 
-    The outer outlines of all pieces and those of holes share the points in proportion to their
+    The outer outlines of all pieces and the outlines of holes get points in proportion to their
     lengths. The inside is on the same side of all outlines.
 
     Args:
@@ -203,7 +202,7 @@ def _smooth(outline: Array) -> Array:
 def centred_view(
     blob: PersonBlob, camera: Camera, level: Array = UPRIGHT, grey: Bytes | None = None
 ) -> tuple[Bytes, Bytes | None]:
-    """The person (h, w), 1 inside, seen by the camera turned to the middle of the box.
+    """Mask (h, w) of the person, 1 inside, in the camera turned to the middle of the box.
 
     Args:
         blob: the person.

@@ -2,10 +2,10 @@
 
     h(cell, angle, s) = sum |grad (G_s * I)| s / contrast     over pixels inside the eroded mask
 
-on a grid about the centroid, by the unsigned angle of the edge, at scales s above those of cloth
+Cells form a grid around the centroid, angles are unsigned, and the scales s are larger than cloth
 patterns. Smoothing uses pixels of the person only, so that the outline makes no edge;
-contrast is the range of the person's grey levels. An outline does not show whether somebody faces
-the camera, and on which side of the trunk an arm lies; edges inside it do.
+contrast is the range of the person's grey levels. An outline does not show whether a person faces
+the camera, or whether an arm is in front of the trunk or behind; edges inside it do.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hmt_ros.inference.arrays import Array
 Bytes = NDArray[np.uint8]
 
 CELLS, ANGLES = 8, 4
-# Standard deviations of the smoothing, px of a person of 128 px.
+# Standard deviations of the smoothing, px, for a person of 128 px.
 SCALES = (1.5, 3.0)
 EDGES = len(SCALES) * CELLS * CELLS * ANGLES
 # Minimum distance of a pixel to the outline, px.
@@ -30,7 +30,7 @@ LEAST_CONTRAST = 20.0
 
 
 def internal_edges(grey: Bytes, mask: Bytes, centre: tuple[float, float], width: float) -> Array:
-    """Square roots (EDGES,) of the amounts of edges, by scale, row, column and angle.
+    """Square roots (EDGES,) of the edge histogram, by scale, row, column and angle.
 
     Args:
         grey: (h, w) grey levels.
@@ -51,7 +51,7 @@ def internal_edges(grey: Bytes, mask: Bytes, centre: tuple[float, float], width:
         for at, middle in ((columns, centre[0]), (rows, centre[1]))
     )
     cells = (down * CELLS + across) * ANGLES
-    # Whole numbers, which OpenCV smooths to the same bits everywhere.
+    # Integers, because OpenCV smooths them to the same bits on all machines.
     weights = np.where(inside, np.uint16(65535), np.uint16(0))
     values = np.where(inside, grey, np.uint8(0)).astype(np.uint16) * np.uint16(257)
     for own, scale in zip(result, SCALES, strict=True):
@@ -68,5 +68,5 @@ def internal_edges(grey: Bytes, mask: Bytes, centre: tuple[float, float], width:
         for which, part in ((first, 1.0 - share), (first + 1.0, share)):
             bins = cells + which.astype(np.intp) % ANGLES
             own += np.bincount(bins, size * part, own.size)
-    # Pixels of a quarter of a cell.
+    # Relative to the number of pixels in a quarter of a cell.
     return np.sqrt(result.ravel() * (4.0 * CELLS * CELLS) / (width * width))

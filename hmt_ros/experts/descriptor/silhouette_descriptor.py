@@ -9,10 +9,10 @@ It has five descriptions of the person, who is first resized to a standard size:
 - edges inside, if there is an image (`internal_edges`). Without an image the descriptor uses their
   mean.
 
-None of them changes with the position and the size of the person in the image. Edge pairs do not
-change with rotation either; the others do, because a camera stands upright and up has a meaning. A
-silhouette and its mirror image have different descriptors. The parts are weighted and projected on
-the principal components of the training silhouettes.
+All are invariant to the position and the size of the person in the image. Edge pairs are also
+invariant to rotation; the others are not, because cameras are usually upright. A silhouette and its
+mirror image have different descriptors. The parts are weighted and projected on the principal
+components of the training silhouettes.
 
 The shape context of a point is the histogram of the positions of the other points relative to it:
 5 radial bins on a log scale from 1/8 to 3 of the mean distance, and 12 angular bins. K-means over
@@ -46,9 +46,9 @@ from hmt_ros.inference.linear_algebra import product
 Bytes = NDArray[np.uint8]
 
 RADIAL, ANGULAR = 5, 12
-RADII = (1 / 8, 3.0)  # of the mean distance between points
-VOTES = 4  # centres that a context votes for
-LEAST_DISTANCE = 1e-3  # minimum distance of a context from a centre in its votes
+RADII = (1 / 8, 3.0)  # smallest and largest radius, in mean distances between points
+VOTES = 4  # number of centres that a context votes for
+LEAST_DISTANCE = 1e-3  # lower bound of the distance in the weight of a vote
 
 PAIR_DISTANCES, PAIR_ANGLES = 6, 8
 PAIR_BINS = PAIR_DISTANCES * PAIR_ANGLES
@@ -58,8 +58,8 @@ BETWEEN = (0.5, 0.25, 0.75)  # positions along a connection that must lie inside
 def shape_contexts(points: Array) -> Array:
     """Shape contexts (N, 60) of points (N, 2): the share of the other points in each bin.
 
-    They do not change with translation or scale; they change with rotation. Points beyond the
-    smallest and largest radius fall into no bin.
+    They are invariant to translation and scale, but not to rotation. Points below the smallest and
+    above the largest radius fall into no bin.
     """
     n = len(points)
     off = points[None] - points[:, None]  # (N, N, 2)
@@ -81,7 +81,7 @@ def shape_contexts(points: Array) -> Array:
 class ShapeContextCodebook:
     """Centres (C, 60) of the square roots of shape contexts.
 
-    The distance between square roots of shares is Hellinger's, in which the fullest bins do not
+    Distances between square roots of shares are Hellinger distances, which the fullest bins do not
     dominate.
 
     Raises:
@@ -112,12 +112,12 @@ class ShapeContextCodebook:
 def edge_pairs(points: Array, directions: Array, mask: Bytes) -> Array:
     """Histogram (48,) of the distances and angles of edge pairs; it sums to 1.
 
-    It does not change with translation, scale or rotation.
+    It is invariant to translation, scale and rotation.
 
     Args:
-        points: (N, 2) on the outlines, px.
-        directions: (N,) of the outlines at the points, rad.
-        mask: (h, w) the silhouette.
+        points: (N, 2) points on the outlines, px.
+        directions: (N,) directions of the outlines at the points, rad.
+        mask: (h, w) mask of the silhouette.
     """
     first, second = _pairs(len(points))
     start = points[first]
@@ -147,12 +147,12 @@ def _pairs(count: int) -> tuple[Index, Index]:
 
 
 SIZE = 128  # longer side of the resized person, px
-MAP = 16  # cells of a side of the map of distances
-EXTENT = 4.4  # width of the map in radii of gyration; stretched arms and legs are inside
+MAP = 16  # number of cells per side of the map of distances
+EXTENT = 4.4  # width of the map in radii of gyration, enough for stretched arms and legs
 DEEPEST, FURTHEST = 0.25, 0.60  # limits of the distances inside and outside, radii of gyration
 MOMENTS = 12
-FIXED = PAIR_BINS + MAP * MAP + MOMENTS + EDGES  # features besides those of the codebook
-FEWEST_POINTS, MOST_POINTS = 8, 500  # on the outline; time and memory grow with their square
+FIXED = PAIR_BINS + MAP * MAP + MOMENTS + EDGES  # number of features other than shape contexts
+FEWEST_POINTS, MOST_POINTS = 8, 500  # on the outline; costs grow with the square
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,11 +236,11 @@ class SilhouetteDescriptor:
 
     @property
     def size(self) -> int:
-        """Length of the vector, p."""
+        """Length of a descriptor, p."""
         return int(self.basis.shape[1])
 
     def describe(self, parts: Iterable[SilhouetteParts]) -> Array:
-        """Vectors (n, p) of silhouettes."""
+        """Descriptors (n, p) of silhouettes."""
         features = [np.concatenate([*features_of(self.codebook, x).values()]) for x in parts]
         off = np.array(features) * self.scale - self.centre
         return np.asarray(product(np.where(np.isnan(off), 0.0, off), self.basis))
@@ -269,7 +269,7 @@ class SilhouetteDescriptor:
 
 
 def features_of(codebook: ShapeContextCodebook, parts: SilhouetteParts) -> dict[str, Array]:
-    """The features of a silhouette, by part, before they are weighted."""
+    """The unweighted features of a silhouette, by part."""
     # Square roots of shares, as in the codebook.
     return {
         'shape_contexts': np.sqrt(codebook.histogram(parts.contexts)),

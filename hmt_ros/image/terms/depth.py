@@ -3,15 +3,15 @@
     E(x) = w / V sum_i rho((D(u_i(x)) - z_i(x)) / sigma_i)
     sigma_i^2 = sigma^2 + (growth D^2)^2 + (noise_i / cos a_i)^2
 
-over the V visible points i of the flesh: on every ring the two on either side of the part that
-faces the camera. D is the depth image, registered to the colour image, z the depth of the point,
-both along the axis of the camera, m. The error of a sensor that triangulates grows with the square
-of the distance [Khoshelham and Elberink, Sensors 2012]; that of the flesh, `noise`, is along the
-normal of the surface, which the ray meets at the angle a. In the gradient the points stay on the
-skin, and their deviations are constant.
+over the V visible points i of the flesh: on every ring, one point on either side of the part that
+faces the camera. D is the depth image, registered to the colour image, and z the depth of the
+point, both along the axis of the camera, m. The error of a triangulating sensor grows with the
+square of the distance [Khoshelham and Elberink, Sensors 2012]. The error of the flesh, `noise`, is
+along the normal of the surface, and a is the angle between the normal and the ray. For the
+gradient, points are fixed to the skin, and standard deviations are constant.
 
-Where nothing was measured a point has the cost of an error of one deviation, whatever the pose. A
-surface before a point, or far behind it, costs at most the maximum of the kernel.
+A point without a measurement has the cost of an error of one standard deviation, whatever the pose.
+A surface in front of a point, or far behind it, costs at most the maximum of the kernel.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from hmt_ros.image.terms.image_term import (
     Weighting,
 )
 
-# Depths that sensors measure, m; nearer and further ones are no evidence.
+# Range of depths that sensors measure, m; other depths are no evidence.
 NEAREST, FURTHEST = 0.2, 20.0
 
 
@@ -44,7 +44,7 @@ NO_DEPTHS = ImageMap(np.zeros((1, 2, 2), np.float32))
 
 
 def usable_depths(depth: NDArray[np.floating]) -> NDArray[np.float32]:
-    """A depth image (H, W), m, with 0 for holes and for depths out of range."""
+    """A depth image (H, W), m, with 0 for missing depths and depths out of range."""
     with np.errstate(invalid='ignore'):
         good = (depth >= NEAREST) & (depth <= FURTHEST)
     result: NDArray[np.float32] = np.where(good, depth, 0.0).astype(np.float32)
@@ -52,7 +52,7 @@ def usable_depths(depth: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def depth_map(window: ImageWindow) -> ImageMap | None:
-    """The depths of a window; None if nothing was measured there."""
+    """The depths of a window; None if no pixel was measured."""
     if window.depth is None:
         return None
     depths = usable_depths(window.depth)

@@ -1,8 +1,8 @@
-"""Edges: visible contour points lie on image edges of their direction (KJS 2).
+"""Edges: visible contour points lie on image edges of the same direction (KJS 2).
 
     E(x) = w / V sum_i rho(d_o(i)(u_i(x)) / sigma)
 
-over the V visible contour points u_i, d_o the distance to the nearest edge of orientation o.
+over the V visible contour points u_i; d_o is the distance to the nearest edge of orientation o.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hmt_ros.image.terms.image_term import (
 ORIENTATIONS: int = core.ORIENTATIONS
 # Canny's thresholds.
 EDGE_LOW, EDGE_HIGH = 40.0, 100.0
-# Edges further outside the silhouette than this belong to the background, px.
+# Distance outside the silhouette beyond which edges belong to the background, px.
 MARGIN = 4
 _DISC = np.array(
     [
@@ -35,7 +35,7 @@ _DISC = np.array(
     ],
     dtype=np.uint8,
 )
-# Distance to an edge that is assumed where somebody else hides the edges, px.
+# Assumed distance to an edge at pixels where another person hides the edges, px.
 HIDDEN = 2.0
 
 
@@ -47,7 +47,7 @@ class EdgeInputs(NamedTuple):
 
 
 def edge_distances(window: ImageWindow) -> ImageMap:
-    """Distance to the nearest edge whose normal falls into each orientation bin, px."""
+    """Distance to the nearest edge, for each orientation bin of its normal, px."""
     grey = cv2.cvtColor(window.image, cv2.COLOR_BGR2GRAY)
     grey = cv2.GaussianBlur(grey, (0, 0), 1.0)
     dx = cv2.Sobel(grey, cv2.CV_16S, 1, 0)

@@ -1,8 +1,8 @@
 """The parts of a term of the image likelihood.
 
-A term is one file here: its default settings, its evidence from an image, and one `ImageTerm` that
-names them; `registry` lists the terms. Its energy is one header in `core/terms`, and `core/terms.h`
-lists those. Nothing else knows the terms.
+Each term has one file in this folder, with its default settings, the extraction of its evidence
+from an image, and one `ImageTerm` that names them; `registry` lists the terms. Its energy is one
+header in `core/terms`; `core/terms.h` lists the headers. No other code depends on the terms.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ class TermSettings:
     """Settings of one term of the likelihood.
 
     Attributes:
-        weight: Number of independent measurements that the term counts for (a plain factor for
+        weight: Number of independent measurements that the term represents (a plain factor for
             keypoints); 0 switches the term off.
-        sigma: Standard deviation of one measurement, px (a factor on the detector's own deviation
-            for keypoints); that of a contour comes on top of what contours of people differ from
-            the model's, in metres. Of depths, m.
+        sigma: Standard deviation of one measurement, px; for keypoints a factor on the detector's
+            standard deviation, for depths in m. For contours, the difference between contours of
+            people and of the model is added.
         scale: Width of the Geman-McClure kernel, in standard deviations.
-        growth: What the square of a depth adds to the standard deviation of the depth, 1/m.
+        growth: Standard deviation of a depth that is proportional to the depth squared, 1/m.
     """
 
     weight: float
@@ -52,16 +52,16 @@ class TermSettings:
 
 @dataclass(frozen=True, eq=False)
 class ImageWindow:
-    """The part of an image that evidence is taken from.
+    """The part of an image from which evidence is taken.
 
     Attributes:
         image: (h, w, 3) BGR.
-        left, top: column and row of its first pixel in the whole image.
+        left, top: column and row of the window's first pixel in the whole image.
         mask: (h, w) silhouette, 0 or 1; None: unknown.
-        unsure: (h, w) pixels that may belong to it, 0 or 1; None if missing.
-        last_image: (h, w, 3) the same part of the image before; None if missing.
-        others: (h, w) pixels that show or may show somebody else, 0 or 1, and are evidence neither
-            for a pose nor against it; None if missing.
+        unsure: (h, w) pixels that possibly belong to the silhouette, 0 or 1; None if missing.
+        last_image: (h, w, 3) the same part of the previous image; None if missing.
+        others: (h, w) pixels that show or possibly show other people, 0 or 1, and are evidence
+            neither for nor against a pose; None if missing.
         depth: (h, w) the same part of the depth image, m; None if missing.
     """
 
@@ -76,7 +76,7 @@ class ImageWindow:
 
     @property
     def widest(self) -> Image | None:
-        """The silhouette (h, w) with all that may belong to it, 0 or 1; None if unknown."""
+        """Silhouette (h, w) with unsure pixels and other people, 0 or 1; None if unknown."""
         widest = self.mask
         if widest is not None:
             for more in (self.unsure, self.others):
@@ -91,8 +91,8 @@ class ImageWindow:
 class Weighting(NamedTuple):
     """`TermSettings` as compiled code reads them; a weight of 0 switches the term off.
 
-    `magnification`, px/m at the person, converts errors of the body to pixels; `segments` are
-    factors (S,) on the energies at each segment, (0,) if all are 1.
+    `magnification`, px/m at the person, converts errors of the body to pixels. `segments` contains
+    factors (S,) on the energies at each segment; (0,) if all are 1.
     """
 
     weight: float
@@ -109,13 +109,13 @@ class ImageTerm:
 
     Attributes:
         name: name of the term, of its settings and of its evidence.
-        meaning: the quantities that it compares; the descriptions of its parameters begin with it.
+        meaning: the compared quantities; descriptions of the term's parameters start with this.
         settings: default settings.
-        evidence: takes the evidence of the term from an image; returns None if missing.
-        inputs: makes the inputs of the core: a NamedTuple that starts with the `Weighting`, read
-            member by member into the struct of its header. Without evidence (None) it has weight 0
-            and empty arrays of the same types.
-        needs_contour: whether the contour has to be traced.
+        evidence: extracts the evidence of the term from an image; returns None if missing.
+        inputs: makes the inputs of the core, a NamedTuple that starts with the `Weighting` and is
+            read field by field into the struct of the term's header. Without evidence (None) the
+            weight is 0, and arrays are empty but of the same types.
+        needs_contour: whether the term needs the contour of the model.
     """
 
     name: str

@@ -1,12 +1,13 @@
-"""Keypoints: distances of projected landmarks from where a detector saw them (KJS 2 and 5.1).
+"""Keypoint energy: distances between projected and detected landmarks (KJS 2 and 5.1).
 
     E(x) = -log sum_e p_e exp(-sum_k E_k,e(x))
     E_k,e(x) = w sum_a rho([W_k (u_k,e(x) - p_k)]_a),         W_k' W_k = (S_k + (m s_k)^2 I)^-1
 
-u_k,e projects the landmark that keypoint k shows, seen at p_k with covariance S_k (px^2) and noise
-s_k on the person (m, at the magnification m, px/m). Detectors take left for right: in the exchange
-e, of prior probability p_e, the keypoints of all limbs, of the arms or of the legs show the
-landmarks of the other side. Depths from a detector count through the slopes of bones.
+u_k,e is the projection of the landmark of keypoint k, which was detected at p_k with covariance S_k
+(px^2) and noise s_k on the person (in metres; the magnification is m px/m). Detectors confuse left
+and right: in the exchange e, of prior probability p_e, the keypoints of all limbs, of the arms or
+of the legs show the landmarks of the other side. For lifted poses, a mixture over joint depths is
+added (`Lifted`).
 """
 
 from __future__ import annotations
@@ -43,16 +44,16 @@ from hmt_ros.inference.linear_algebra import cholesky, inverse
 KEYPOINTS = TermSettings(0.5, 1.0, 3.0)
 # Assumed height of the visible part of a person whose distance is unknown, m.
 USUAL_EXTENT = 1.4
-# Stature of the person that the landmark offsets of the table belong to, m.
+# Stature of the person for whom the landmark offsets of the table hold, m.
 USUAL_STATURE = 1.7
 # Minimum standard deviation of a keypoint whose noise is learned, px.
 SMALLEST_SIGMA = 1.5
 # Factor on the energy of a mixture over lifted poses, because errors of joints are correlated; and
-# scale of its kernel, in standard deviations, because one limb or all may be elsewhere. Both were
-# chosen together with the time of `ERRORS['lifted']`.
+# scale of its kernel, in standard deviations, because limbs of lifted poses may be wrong. Both were
+# chosen together with the time constant of `ERRORS['lifted']`.
 LIFTED_WEIGHT, LIFTED_SCALE = 0.1, 3.0
-# Groups of landmarks that change sides together, and the groups (E, G) that do so in each exchange:
-# none, all, the arms, the legs.
+# Groups of landmarks that change sides together, and the groups (E, G) that change sides in each
+# exchange: none, all, arms, legs.
 CENTRE, ARMS, LEGS = range(3)
 EXCHANGED = np.array([[0, 0, 0], [1, 1, 1], [0, 1, 0], [0, 0, 1]], dtype=np.int64)
 
@@ -67,19 +68,19 @@ class Keypoints:
     Attributes:
         names: (n,) joints of the body; before `named_for`, landmarks of the detector.
         pixels: (n, 2) column and row, px; NaN where a joint was not seen.
-        covariances: (n, 2, 2) px^2; NaN where unknown, before `named_for` only.
+        covariances: (n, 2, 2) px^2; NaN where unknown, which is possible only before `named_for`.
         confidences: (n,) from 0 (ignored) to 1 (sure).
-        positions: (n, 3) from a detector that lifts, m, along the axes of the camera from a common
-            origin; NaN where unknown. None if the detector does not lift.
+        positions: (n, 3) 3D positions, m, along the axes of the camera from a common origin; NaN
+            where unknown. None if the detector gives no 3D positions.
         landmarks: (n,) canonical names of landmarks (`keypoint_schemes`), '' for joints; None:
-            all names are those of joints.
+            all keypoints are joints.
         scheme: keypoint scheme of the detector, once it is known.
         lifted: mixture over whole poses from keypoints or positions; only its depths count, because
             across the line of sight the keypoints themselves are the evidence.
-        offsets: (n, 3) of the landmarks from the joint in the frame of its segment, m; None: joints
-            were seen.
+        offsets: (n, 3) from each joint to its landmark in the frame of the joint's segment, m;
+            None: the keypoints are joints.
         noise: (n,) standard deviations in addition to the covariances, m on the person; they
-            account for the confidences. None: confidences are factors on the precisions.
+            include the effect of confidences. None: confidences are factors on the precisions.
     """
 
     names: tuple[str, ...]
@@ -138,13 +139,13 @@ class Keypoints:
         )
 
     def named_for(self, body: Body, scheme: str = 'auto') -> tuple[Keypoints, list[str]]:
-        """Keypoints at joints of a body, under the body's names, and the names that the body lacks.
+        """Keypoints renamed after the joints of a body, and the names that the body lacks.
 
         Unknown covariances are replaced by the learned noise of the scheme.
 
         Args:
-            scheme: scheme of the names, see `keypoint_schemes`; 'auto' selects one that has them
-                all, 'joints' means that they are names of joints.
+            scheme: scheme of the names, see `keypoint_schemes`; 'auto' selects a scheme with all
+                names, 'joints' means that the names are joints of the body.
 
         Raises:
             ValueError: there is no such scheme.
@@ -196,14 +197,14 @@ class Keypoints:
 
 
 class Points(NamedTuple):
-    """P keypoints, each with its landmark as named and its landmark with exchanged sides.
+    """P keypoints, each with its own landmark and with that of the other side.
 
     Attributes:
         segments: (P, 2) segments that carry the landmarks.
         offsets: (P, 2, 3) of the landmarks in the frames of the segments, m.
         pixels: (P, 2).
-        whiteners: (P, 2, 2) W, W' W is the precision.
-        groups: (P,) group that each changes sides with.
+        whiteners: (P, 2, 2) W, where W' W is the precision.
+        groups: (P,) group with which each keypoint changes sides.
     """
 
     segments: Index
@@ -214,7 +215,7 @@ class Points(NamedTuple):
 
 
 class Lifted(NamedTuple):
-    """Depths of joints (J,) behind the middle of the hips, a mixture of C components.
+    """Mixture of C components over the depths of J joints behind the middle of the hips.
 
     Attributes:
         segments: (J,) segments that carry the joints.
@@ -227,7 +228,7 @@ class Lifted(NamedTuple):
         precisions: (2, C, J) square roots of the precisions, 1/m.
         readings: (E,) row of `depths`, 0 or 1, that applies in each exchange of sides.
         weight: factor on the energy; 0 without a mixture.
-        scale: of the kernel, in standard deviations; it bounds the energy of a joint.
+        scale: scale of the kernel, in standard deviations; it bounds the energy of a joint.
     """
 
     segments: Index
@@ -249,11 +250,11 @@ class KeypointInputs(NamedTuple):
         points: the measured keypoints.
         lifted: the mixture over whole poses.
         tree, lens: skeleton and camera.
-        scale: of the kernel, in standard deviations.
+        scale: scale of the kernel, in standard deviations.
         weights: (G,) factors on the energies of the groups.
-        factors: (S,) on the energies of keypoints of each segment as named; (0,) if all are 1.
+        factors: (S,) factors on energies, by the segment of the keypoint as named; (0,) if all 1.
         exchanged: (E, G) 1 where a group changes sides in an exchange.
-        log_priors: (R, E) of the exchanges, one row per problem or one for all.
+        log_priors: (R, E) log priors of the exchanges, one row per problem or one for all.
     """
 
     points: Points
@@ -271,19 +272,19 @@ class KeypointInputs(NamedTuple):
 class KeypointTerm:
     """Minus the log-likelihood of keypoints.
 
-    Keypoints that were not seen (NaN) or have no confidence do not count.
+    Keypoints that were not seen (NaN) or have confidence 0 are ignored.
 
     Attributes:
         skeleton, camera: the person, and the camera that sees the person.
-        keypoints: the detected ones.
+        keypoints: the detected keypoints.
         settings: weight w, factor on the standard deviations, and scale of the kernel; an
             infinite scale gives least squares.
         magnification: px/m at the person; 0 if unknown.
-        exchanges: (R, E) log probability of each exchange before the image, one row per problem
-            or one for all; None if sides are never exchanged.
+        exchanges: (R, E) log prior probability of each exchange, one row per problem or one for
+            all; None if sides are never exchanged.
         beliefs: (G,) factors on the energies of the groups of landmarks; None if all are 1.
         lifted_share: factor on the energy of the mixture over whole poses.
-        segments: (S,) factors on the energies of keypoints of each segment as named; (0,) or None
+        segments: (S,) factors on energies, by the segment of the keypoint as named; (0,) or None
             if all are 1.
 
     Raises:
@@ -318,7 +319,7 @@ class KeypointTerm:
         )
 
     def exchanged(self, frames: Frames, rows: Index) -> Array:
-        """Log probabilities (N, E) of the exchanges at the frames of N poses."""
+        """Posterior log probabilities (N, E) of the exchanges at the frames of N poses."""
         inputs = self.compiled
         priors = inputs.log_priors[rows if len(inputs.log_priors) > 1 else [0] * frames.count]
         result = np.empty(priors.shape)
@@ -354,7 +355,7 @@ class KeypointTerm:
     def distances(self, frames: Frames) -> Array:
         """Distances (N, P) of the P seen keypoints from N poses, in standard deviations.
 
-        They are those of the likeliest exchange of sides; NaN for landmarks behind the camera.
+        Sides are exchanged in the likeliest way; landmarks behind the camera have NaN.
         """
         errors = np.empty((frames.count, len(self.measured.joints), 2))
         keypoint_errors(self.compiled, *frames.by_pose(), errors)
@@ -375,11 +376,11 @@ class KeypointTerm:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredKeypoints:
-    """P keypoints that count, as inputs of the kernel, the same for all poses of a skeleton.
+    """P usable keypoints, as inputs of the kernel, the same for all poses of a skeleton.
 
     Attributes:
-        joints: (P, 2) joints of the skeleton that they show, with sides as named and exchanged.
-        points: where they were seen, and on which segment they lie.
+        joints: (P, 2) joints that the keypoints show, with sides as named and exchanged.
+        points: pixels of the keypoints, and the segments on which they lie.
         lifted: the mixture over whole poses.
     """
 
@@ -388,8 +389,8 @@ class MeasuredKeypoints:
     lifted: Lifted
 
 
-# A track makes a term for every set of hypotheses of an image, and a start makes one for every
-# trial of lengths. Inputs that depend on neither the hypotheses nor the lengths are computed once.
+# A track makes a term for every set of hypotheses of an image, and its start makes one for every
+# trial of bone lengths. Inputs that depend on neither of these are computed once.
 @lru_cache(maxsize=16)
 def _measured(
     skeleton: Skeleton, keypoints: Keypoints, sigma: float, magnification: float
@@ -408,7 +409,7 @@ def _measured(
 
 @lru_cache(maxsize=16)
 def _whitened(keypoints: Keypoints, sigma: float, magnification: float) -> tuple[Keypoints, Array]:
-    """The keypoints that count, and matrices (P, 2, 2) that whiten their noise."""
+    """The usable keypoints, and matrices (P, 2, 2) that whiten their noise."""
     k = keypoints[np.flatnonzero(keypoints.seen)]
     covariances = sigma**2 * k.covariances
     confidences = k.confidences[:, None, None]
@@ -461,7 +462,7 @@ def _lifted(skeleton: Skeleton, poses: LiftedPoses | None, sigma: float) -> Lift
 
 @lru_cache(maxsize=16)
 def groups_of(skeleton: Skeleton) -> Index:
-    """Group (S,) that landmarks on each segment change sides with."""
+    """Group (S,) with which the landmarks on each segment change sides."""
     result = np.full(len(skeleton.parents), CENTRE, dtype=np.int64)
     for chain, segments in skeleton.chains.items():
         result[list(segments)] = {'arm': ARMS, 'leg': LEGS}.get(chain.rpartition('_')[2], CENTRE)

@@ -2,8 +2,8 @@
 
     E_image(x) = sum_t E_t(x)        over the terms t of the registry
 
-A new term is a file beside this one and a line in `TERMS`, and the same in the core, which runs the
-terms pose by pose: a header in `core/terms` and a line in `core/terms.h`, in the same order.
+A new term needs a file in this folder and a line in `TERMS`, and in the core, which computes the
+terms pose by pose, a header in `core/terms` and a line in `core/terms.h`, in the same order.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Model(NamedTuple):
         tree, flesh, lens: skeleton, parts and rings, camera.
         traced: (B,) parts whose contour is compared with the image.
         occluders: (B,) parts that can hide others.
-        contour_points: number of contour points that the weights refer to; 0: those that exist.
+        contour_points: number of contour points to which weights refer; 0: that of existing points.
     """
 
     tree: Tree

@@ -2,9 +2,9 @@
 
     coverage      E(x) = w / M sum_m rho(|u_i(m)(x) - s_m| / sigma)
 
-s_m are M samples of the outline of the silhouette, u_i points of the model's contour, and i(m) is
-the one nearest to sample m. The model explains the silhouette when its outline lies on the contour
-of the model.
+s_m are M samples of the outline of the silhouette, u_i are points of the model's contour, and i(m)
+is the index of the point nearest to sample m. The energy is small if the outline of the silhouette
+lies on the contour of the model.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hmt_ros.inference.arrays import Array
 
 # Approximate number of samples on the outline.
 OUTLINE_POINTS = 120
-# Minimum length of an outline that counts, px.
+# Minimum length of an outline that is sampled, px.
 SHORTEST = 12
 
 
@@ -34,9 +34,9 @@ class Outline(NamedTuple):
     """M samples on the outline of a silhouette.
 
     Attributes:
-        pixels: (M, 2).
+        pixels: (M, 2) positions of the samples.
         normals: (M, 2) unit vectors out of the silhouette.
-        beliefs: (M,) belief in each, 0 to 1.
+        beliefs: (M,) belief in each sample, 0 to 1.
     """
 
     pixels: Array
@@ -48,10 +48,10 @@ class CoverageInputs(NamedTuple):
     """Inputs of `core/terms/coverage.h`.
 
     Attributes:
-        term: weighting.
-        outline: samples.
-        explained: (X, M) maximum energy of samples; one row per pose, or one for all.
-        costs: (N, M) result: energy of each sample; (0, M) if it is not wanted.
+        term: weight and noise of the term.
+        outline: samples on the outline.
+        explained: (X, M) maximum energy of each sample; one row per pose, or one for all.
+        costs: (N, M) output, energy of each sample; (0, M) if not wanted.
     """
 
     term: Weighting

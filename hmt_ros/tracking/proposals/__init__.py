@@ -1,4 +1,4 @@
-"""Propose: the sources of hypotheses (KJS 3 and 5). Each proposal is a function."""
+"""Propose: functions that propose hypotheses (KJS 3 and 5)."""
 
 from __future__ import annotations
 
@@ -24,15 +24,16 @@ class Proposal(Protocol):
         """Proposes hypotheses to optimise, if any, without setting their weights.
 
         Args:
-            search: of the image.
-            sources: starting points of the optima `search.base`.
+            search: inputs and optima of the image.
+            sources: hypotheses at the starting points of the optima `search.base`.
             rng: source of randomness.
         """
         ...
 
 
-# Proposals of every tracker, before the one that the setting `proposals` selects. Each decides
-# whether it applies to an image. To add a proposal, add a file beside this one and a name here.
+# Proposals of every tracker, used before the one that the setting `proposals` selects. Each
+# proposal decides whether it applies to an image. To add a proposal, add a file in this folder and
+# a name here.
 USUAL: tuple[Proposal, ...] = (predicted_poses, reversed_poses)
 SELECTED: Mapping[str, Proposal] = MappingProxyType(
     {'kjs': jumped_poses, 'css': covariance_scaled_poses, 'ss': spherical_poses}
@@ -40,10 +41,10 @@ SELECTED: Mapping[str, Proposal] = MappingProxyType(
 
 
 def proposals_of(selected: str) -> tuple[Proposal, ...]:
-    """The proposals of a tracker, by its setting.
+    """Returns the proposals that a tracker uses.
 
     Raises:
-        ValueError: an unknown name.
+        ValueError: the name is unknown.
     """
     if selected not in SELECTED:
         raise ValueError(f'proposals must be one of {tuple(SELECTED)}, saw {selected!r}')
@@ -56,5 +57,5 @@ def propose(
     sources: Hypotheses,
     rng: np.random.Generator,
 ) -> Hypotheses:
-    """All hypotheses of some proposals; the other arguments as for each of them."""
+    """Concatenates the hypotheses of proposals; see `Proposal` for the other arguments."""
     return joined([each(search, sources, rng) for each in proposals])

@@ -1,17 +1,17 @@
 """Kinematic jump sampling: other configurations of the limbs and of the trunk (KJS 3, 4).
 
-For each distinct trunk among the modes, every limb has alternatives: those of the modes, all their
-flips, and, if no keypoints show it or the image is surprising, the results of an image search.
-Combinations of alternatives are rated on the unchanged trunk, with confused limbs exchanged, and
-with the torso flipped; the best representatives become candidates.
+For each distinct trunk among the modes, every limb has alternatives: its configurations in the
+modes, all their flips, and the results of an image search if no keypoints show the limb or the
+image is surprising. Combinations of alternatives are rated on the unchanged trunk, with two limbs
+exchanged, and with the torso flipped; the best representatives become candidates.
 
 Covariance-scaled sampling of one limb at a time (KJS 3).
 
     E(a) = E_image(a) + E_keypoints(a) + E_prior(a) + E_motion(a)      over the angles a of a limb
 
-Given the trunk, limbs are nearly independent: instead of all 37 degrees of freedom, the four to six
-of one limb are sampled and compared with the image there, and the best samples are refined. The
-part of the silhouette's outline that the rest of the body explains costs a limb nothing.
+Given the trunk, limbs are nearly independent. Instead of all 37 degrees of freedom, the four to six
+of one limb are sampled and compared with the image near the limb, and the best samples are refined.
+The limb need not explain a part of the silhouette's outline that the rest of the body explains.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from hmt_ros.tracking.settings import (
     EvaluationPlan,
 )
 
-# Smallest change of a variable that is a jump, rad or m.
+# Change of a variable above which it has jumped, rad or m.
 STILL = float(np.sqrt(np.finfo(np.float64).eps))
 
 
@@ -54,15 +54,15 @@ def find_limb(
     plan: EvaluationPlan,
     rng: np.random.Generator,
 ) -> Array:
-    """Angles (A, chain dofs) of a limb that fit the image, not necessarily distinct.
+    """Searches angles (A, chain dofs) of a limb that fit the image; they may repeat.
 
     Args:
-        posterior: of the body before the camera.
+        posterior: energies of poses of the body.
         chain: name of the limb.
-        pose: (d,) with the other limbs, which stay fixed.
-        covariance: (d, d) of the predicted pose.
-        observation: of the image.
-        plan: allocation of its evaluations.
+        pose: (d,) pose, in which the other limbs are fixed.
+        covariance: (d, d) covariance of the predicted pose.
+        observation: observation of the image.
+        plan: allocation of the image's evaluations.
         rng: source of randomness.
     """
     body, s = posterior.body, posterior.settings.search
@@ -91,7 +91,7 @@ def _drawn(
     n: int,
     rng: np.random.Generator,
 ) -> Array:
-    """N samples: a third each from the mode, the stretched mode and the body's prior."""
+    """Draws n samples, a third each from the mode, the stretched mode and the body's prior."""
     noise = standard_normals(rng, (n, len(own)))
     near: Array = product(noise, cholesky(block).T)
     near[n // 3 :] *= stretch
@@ -103,7 +103,7 @@ def _drawn(
 
 
 def jumped_poses(search: Search, sources: Hypotheses, rng: np.random.Generator) -> Hypotheses:
-    """Hypotheses at combinations of limb and trunk configurations that fit the image."""
+    """Proposes combinations of limb and trunk configurations that fit the image."""
     posterior, observation, plan = search.posterior, search.observation, search.plan
     base, body = search.base, posterior.body
     limbs = limbs_not_shown(posterior, observation, plan.surprising)
@@ -144,13 +144,14 @@ def jumped_poses(search: Search, sources: Hypotheses, rng: np.random.Generator) 
     poses, members, energies = (np.concatenate(parts) for parts in zip(*everything, strict=True))
     kept = search.best(poses, energies)
     poses, members = poses[kept], members[kept]
-    # The motion prior of a chain that jumped is centred at its new place, else at the prediction.
+    # The motion prior of a jumped variable is centred at its new value, otherwise at the
+    # prediction.
     jumped = np.abs(poses - base.x[members]) > STILL
     return sources.proposed(members, poses, jumped)
 
 
 def _groups(search: Search) -> list[Index]:
-    """Groups of modes with nearly the same trunk, the best mode of each first."""
+    """Groups modes with nearly the same trunk; the best mode of a group is the first."""
     skeleton = search.posterior.body.skeleton
     trunk = search.base_joints[:, skeleton.joint_index(skeleton.trunk_joints)]
     left = np.argsort(search.base.value, kind='stable')
@@ -164,9 +165,9 @@ def _groups(search: Search) -> list[Index]:
 
 
 def limbs_not_shown(posterior: Posterior, observation: Observation, surprising: bool) -> list[str]:
-    """The limbs to search for in an image: those that no keypoints show.
+    """Names of the limbs to search in an image, because keypoints do not show them.
 
-    Two keypoints fix a limb up to its flips; samples away from them mostly find other limbs and
+    Two keypoints determine a limb up to its flips; samples away from them mostly fit other limbs or
     the background. In a surprising image the keypoints may be wrong.
     """
     if not {'coverage', 'edges'} & observation.evidence.keys():
@@ -190,13 +191,13 @@ def limbs_not_shown(posterior: Posterior, observation: Observation, surprising: 
 def _search_limbs(
     limbs: list[str], search: Search, pose: Array, ancestor: int, rng: np.random.Generator
 ) -> dict[str, Array]:
-    """Configurations of randomly chosen limbs that fit the image; a pose (d,) fixes the others.
+    """Searches configurations of randomly chosen limbs that fit the image.
 
     Args:
-        limbs: candidates for the search.
-        search: of the image.
-        pose: (d,) the first of a group.
-        ancestor: of that pose.
+        limbs: names of the limbs to choose from.
+        search: inputs and optima of the image.
+        pose: (d,) first pose of a group, in which the other limbs are fixed.
+        ancestor: row of the ancestor of the pose.
         rng: source of randomness.
     """
     count = min(search.plan.searched_chains, len(limbs))

@@ -22,16 +22,16 @@ from hmt_ros.tracking.optimisation import Search
 def spherical_samples(
     body: Body, means: Array, covariances: Array, count: int, scale: float, rng: np.random.Generator
 ) -> Array:
-    """Isotropic noise around each mean, with the volume of its covariance; (K, count, d).
+    """Samples (K, count, d) with isotropic noise of the volume of each covariance.
 
-    The radius is the geometric mean of the axes of the ellipsoid, |S|^(1/2d). Samples that leave
-    the limits are projected back.
+    The radius is the geometric mean of the axes of the ellipsoid, |S|^(1/2d). Samples are clipped
+    to the limits.
 
     Args:
-        body: with the limits.
-        means, covariances: (K, d), (K, d, d).
+        body: body with the limits.
+        means, covariances: means (K, d) and covariances (K, d, d) of the modes.
         count: number of samples per mean.
-        scale: factor on the radius; 0: Cauchy tails of scale 1.
+        scale: factor on the radius; 0 selects Cauchy noise of scale 1.
         rng: source of randomness.
     """
     d = means.shape[1]
@@ -44,7 +44,7 @@ def spherical_samples(
 def covariance_scaled_samples(
     body: Body, means: Array, covariances: Array, count: int, scale: float, rng: np.random.Generator
 ) -> Array:
-    """Noise with the scaled covariance of each mean, (K, count, d); see `spherical_samples`."""
+    """Samples (K, count, d) with the scaled covariance of each mode; see `spherical_samples`."""
     factors = cholesky(covariances)
     noise = _noise((len(means), count, means.shape[1]), scale, rng)
     samples: Array = np.clip(
@@ -54,7 +54,7 @@ def covariance_scaled_samples(
 
 
 def _noise(shape: tuple[int, ...], scale: float, rng: np.random.Generator) -> Array:
-    """Gaussian noise times a scale, or multivariate Cauchy noise where the scale is 0."""
+    """Gaussian noise times a scale, or multivariate Cauchy noise if the scale is 0."""
     noise = standard_normals(rng, shape)
     if scale > 0:
         return scale * noise
@@ -80,7 +80,7 @@ def _sampled(
     sources: Hypotheses,
     rng: np.random.Generator,
 ) -> Hypotheses:
-    """Representatives of the samples and the optima of the predictions."""
+    """Selects representatives of the samples and of the optima of the predictions."""
     posterior, k = search.posterior, len(sources)
     s, body = posterior.settings, posterior.body
     each = max(s.samples // k, 1)

@@ -1,20 +1,21 @@
-"""Whole poses to search from: predicted poses, poses by keypoints alone, and reversals.
+"""Proposals of whole poses: predicted poses, poses fitted to keypoints alone, and reversals.
 
-Pose hypotheses from an external single-image predictor, such as a mixture of experts, are
-proposals and not evidence: that would count the image twice.
+Pose hypotheses from an external single-image predictor, such as a mixture of experts, are proposals
+and not evidence, because the image would then be counted twice.
 
-Poses fitted to keypoints alone, for when a wrong silhouette draws the modes away from them:
+Poses fitted to keypoints alone help when a wrong silhouette draws the modes away from the
+keypoints:
 
     x' = argmin sum_p d_p(x)^2 / 2 + E_prior(x) + (x - f)' P (x - f) / 2
 
 d_p is the distance to keypoint p in standard deviations; f is the predicted pose of the heaviest
-mode, or x' of the previous image while silhouette and keypoints disagree; P is the precision of the
-prediction.
+mode, or, while silhouette and keypoints disagree, x' of the previous image; P is the precision of
+the prediction.
 
 A reversal is the whole pose reversed in depth, with left and right exchanged (`body.mirror`). A
-silhouette hardly distinguishes a pose from its reversal, so a track may follow a turn the wrong way
-round, and no jump of a limb corrects that. If no mode of comparable weight faces one of the two
-ways, the best mode is reversed.
+silhouette hardly distinguishes a pose from its reversal, so a track may follow a turn in the wrong
+direction, and no jump of a limb corrects that. If one of the two facing directions has no mode of
+comparable weight, the best mode is reversed.
 """
 
 from __future__ import annotations
@@ -36,10 +37,10 @@ from hmt_ros.tracking.validity import UNDECIDED, ByKeypoints
 
 
 class PoseByKeypoints:
-    """The pose by keypoints alone, followed while the modes miss some of them.
+    """Pose fitted to keypoints alone, followed while the modes miss a group of keypoints.
 
     Attributes:
-        pose: (1, d) in the last image; None: the modes explain every group of keypoints.
+        pose: (1, d) pose in the last image; None: the modes explain every group of keypoints.
     """
 
     def __init__(self) -> None:
@@ -49,16 +50,16 @@ class PoseByKeypoints:
     def follow(
         self, search: Search, mode: Array, term: KeypointTerm, missed: Misfit
     ) -> ByKeypoints | None:
-        """Updates the pose by the keypoints of an image.
+        """Updates the pose from the keypoints of an image.
 
         Args:
-            search: of the image.
-            mode: (d,) the heaviest.
-            term: of the keypoints.
+            search: inputs and optima of the image.
+            mode: (d,) pose of the heaviest mode.
+            term: energy term of the keypoints.
             missed: misfit of the modes to the keypoints.
 
         Returns:
-            Misfit and gain of the pose by keypoints; None if the modes explain enough keypoints.
+            Misfit and gain of the pose; None if the modes explain enough keypoints.
         """
         if not _misses_a_group(missed):
             self.pose = None
@@ -75,7 +76,7 @@ class PoseByKeypoints:
 
 
 def predicted_poses(search: Search, sources: Hypotheses, _rng: np.random.Generator) -> Hypotheses:
-    """The means of a prediction, if there is one, each as a jump from the nearest mode."""
+    """Proposes the means of a prediction, if any, as jumps from their nearest modes."""
     if search.prediction is None:
         return sources[:0]
     poses = search.prediction.seen_as(search.posterior.person).means
@@ -85,11 +86,11 @@ def predicted_poses(search: Search, sources: Hypotheses, _rng: np.random.Generat
 
 
 def keypoint_poses(search: Search, sources: Hypotheses) -> Hypotheses:
-    """The pose to which keypoints alone move the heaviest mode, if it misses too many of them.
+    """Proposes the heaviest mode, fitted to keypoints alone, if it misses too many keypoints.
 
-    It is proposed if the optimum of the mode misses more than a quarter of the keypoints of a
-    group, because the silhouette keeps back limbs that have moved far since the previous image. It
-    is dropped if it is out of the person's reach: then the keypoints belong to somebody else, or
+    The condition is that the optimum of the mode misses more than a quarter of the keypoints of a
+    group: the silhouette holds back limbs that have moved far since the previous image. The pose is
+    dropped if the person cannot have moved there: then the keypoints belong to another person, or
     the track is lost.
     """
     posterior, observation = search.posterior, search.observation
@@ -107,7 +108,7 @@ def keypoint_poses(search: Search, sources: Hypotheses) -> Hypotheses:
 
 
 def reversed_poses(search: Search, sources: Hypotheses, _rng: np.random.Generator) -> Hypotheses:
-    """The reversal of the best mode, if no mode of comparable weight faces one of the ways."""
+    """Proposes the reversed best mode if a facing direction has no mode of comparable weight."""
     log_weights = search.base_rated[: len(search.modes)]
     if not lost_a_facing(search.modes.back, log_weights):
         return sources[:0]
@@ -123,7 +124,7 @@ def _misses_a_group(missed: Misfit) -> bool:
 
 
 def _by_keypoints(search: Search, before: Array | None) -> Array:
-    """The pose x', (1, d), of an image with keypoints."""
+    """Fits the pose x' (1, d) to the keypoints of an image."""
     posterior = search.posterior
     first = search.continuity.predicted[:1] if before is None else before
     placing = posterior.placing(search.observation)

@@ -1,4 +1,4 @@
-"""Small videos, and what detectors write."""
+"""Small videos and the output files of detectors."""
 
 import struct
 
@@ -10,7 +10,7 @@ SIZE = (64, 48)  # width and height, px
 
 
 def shade(number):
-    """Image of a frame whose grey level tells its number; the upper left corner is bright."""
+    """Image of a frame whose grey level encodes its number; the upper left corner is bright."""
     image = np.full((SIZE[1], SIZE[0], 3), 20 + 8 * number, np.uint8)
     image[:12, :16] = 250
     return image
@@ -31,13 +31,13 @@ def write_video(path, count=10, fps=25.0, image=shade):
 
 @pytest.fixture(name='number_in')
 def _number_in():
-    """Function image -> number of the frame that it is."""
+    """Function image -> number of its frame."""
     return number_in
 
 
 @pytest.fixture
 def video(tmp_path):
-    """A video of 10 frames, 25 a second."""
+    """A video of 10 frames at 25 Hz."""
     return write_video(tmp_path / 'short.mp4')
 
 
@@ -64,5 +64,5 @@ def _with_pixel_aspect(content, across, down):
 
 @pytest.fixture
 def with_pixel_aspect():
-    """Function (MP4 file, width, height) -> the file with pixels of such a shape."""
+    """Function (MP4 file, width, height) -> the file with pixels of that aspect ratio."""
     return _with_pixel_aspect

@@ -1,4 +1,4 @@
-"""The check of a clip: confidences, sizes and orders of points that their file does not tell."""
+"""The check of a clip: confidences, sizes and point orders not stated in the file."""
 
 import json
 
@@ -31,7 +31,7 @@ class Numbered(FrameSource):
 
 
 def walker(scheme, count=30, away=0.0):
-    """(T, n, 3) columns, rows and confidences of somebody who walks and turns."""
+    """(T, n, 3) columns, rows and confidences of a person who walks and turns."""
     poses = procedural_sequence('walk', BODY, 3.0, 0).poses[::3][:count].copy()
     poses[:, :3] = 0.3 + away, 0.0, 4.0
     skeleton, marks = BODY.skeleton, schemes()[scheme].landmarks
@@ -45,7 +45,7 @@ def walker(scheme, count=30, away=0.0):
 
 
 def read(path, points, **reading):
-    """Keypoints of the person by frame, and what was told; points: (T, n, 3)."""
+    """Keypoints of the person by frame, and the messages, from points (T, n, 3)."""
     entries = [{'image_id': t, 'keypoints': x.ravel().tolist()} for t, x in enumerate(points)]
     path = path / 'walk.json'
     path.write_text(json.dumps(entries), 'utf-8')
@@ -73,7 +73,7 @@ def test_bones_tell_the_order(scheme, usual, tmp_path):
     chosen, told = read(tmp_path, points)
     assert chosen[0].names == schemes()[scheme].names
     assert f'in the order of {scheme}, not in that of {usual}; --scheme {usual}' in told
-    # Who says the order is believed.
+    # A given order is used.
     assert read(tmp_path, points, scheme=usual)[0][0].names == schemes()[usual].names
 
 
@@ -84,7 +84,7 @@ def test_points_in_no_order_are_refused(tmp_path):
     ):
         read(tmp_path, points)
     assert len(read(tmp_path, points, scheme='coco17')[0]) == 30
-    # Few images tell nothing.
+    # Few images are not enough.
     assert len(read(tmp_path, points[:9])[0]) == 9
 
 
@@ -100,7 +100,7 @@ def test_half_a_person_keeps_the_usual_order(scheme, hidden, tmp_path):
 
 
 def test_two_people_in_one_list(tmp_path):
-    """Legs of the one and the rest of the other; or the one and the other in turns."""
+    """Legs of one person and the rest of another, or both people alternately."""
     one, other = walker('coco17'), walker('coco17', away=-0.9)
     mixed = one.copy()
     mixed[:, 11:] = other[:, 11:]
@@ -135,7 +135,7 @@ def test_points_of_smaller_images(tmp_path):
         read(tmp_path, points, points_size=(300, 300))
     with pytest.raises(ValueError, match=r'lie outside of the images, .* --keypoints-size WxH'):
         read(tmp_path, points * (2, 2, 1))
-    # Feet below the image that the detector guesses are no reason.
+    # Feet guessed below the image have no effect.
     points[:, 13:, 1:] = 600.0, 0.1
     assert read(tmp_path, points)[1] == ''
 
@@ -149,7 +149,7 @@ def test_fractions(tmp_path):
 
 
 def test_mirror_images(tmp_path):
-    """What a mirror image shows on the left is the right; twice is once."""
+    """In a mirror image left is right; mirroring twice is the identity."""
     points = walker('coco17')
     plain, _ = read(tmp_path, points)
     chosen, _ = read(tmp_path, points, mirror=True)

@@ -130,7 +130,7 @@ def test_one_of_several_persons(video, tmp_path):
 
 
 class FakePose:
-    """Finds the person in every second image, at the number of the call."""
+    """Detector that finds the person in every second image, at the index of the call."""
 
     def __init__(self, *, with_mask):
         self.mask, self.calls, self.stamps, self._with_mask = None, 0, [], with_mask
@@ -181,7 +181,7 @@ def test_detector_sees_square_pixels(video, with_pixel_aspect, tmp_path, monkeyp
     assert set(sizes) == {(48, 128)}
     found = content(tmp_path / 'bag')
     second = found['/keypoints'][1][1]
-    # Where it sees (2, 2); the centre of the first pixel is 0.
+    # The detector's (2, 2) in the image, where the centre of the first pixel is 0.
     assert (second.u[0], second.v[0]) == (0.75, 2.0)
     assert np.allclose(np.reshape(second.covariance, (3, 2, 2))[0], [[0.25, 0], [0, 1]])
     assert decode_mask(found['/mask'][3][1]).sum() == 4 * 64
@@ -191,7 +191,7 @@ def test_detector_sees_square_pixels(video, with_pixel_aspect, tmp_path, monkeyp
 
 
 class FakePeople:
-    """Two people, and nobody in every other image; it sees square pixels."""
+    """Detector of two people, in every other image; it gets square pixels."""
 
     def __init__(self, most):
         self.most, self.calls = most, 0
@@ -231,8 +231,8 @@ def test_video_that_breaks_off_is_told(video, tmp_path, capsys):
     path.write_bytes(whole[: len(whole) // 2])
     assert run(path, tmp_path / 'bag') == 0
     (line,) = capsys.readouterr().err.splitlines()
-    assert 'of the 20 frames that its head announces can be read' in line
-    # A detector that saw the whole video has keypoints of all its frames.
+    assert 'of the 20 frames that its header announces can be read' in line
+    # A detector run on the whole video has keypoints of all its frames.
     for found in (arrays(tmp_path / 'all.npz', 20), tmp_path / 'all.csv'):
         if found.suffix == '.csv':
             found.write_text('frame,a_u,a_v\n' + ''.join(f'{i},5,6\n' for i in range(20)), 'utf-8')
@@ -316,7 +316,7 @@ def test_images_of_several_sizes(folder, tmp_path, capsys):
 
 
 def test_a_mirrored_recording(video, tmp_path):
-    """Frames, keypoints, positions and masks are turned; sides have each other's names."""
+    """Frames, keypoints, positions and masks are mirrored; sides swap their names."""
     (tmp_path / 'masks').mkdir()
     picture = np.zeros((48, 64), np.uint8)
     picture[:, :10] = 255

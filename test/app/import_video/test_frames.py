@@ -11,7 +11,7 @@ from msg_tools.files.display_matrix import display_matrix
 
 
 def boxes(content, start, end):
-    """(kind, begin, end) of the boxes of an MP4 file between two places."""
+    """(kind, begin, end) of the boxes of an MP4 file between two offsets."""
     while start < end:
         size, kind = struct.unpack_from('>I4s', content, start)
         yield kind.decode(), start, start + size
@@ -19,7 +19,7 @@ def boxes(content, start, end):
 
 
 def find(content, *path):
-    """Begins of the boxes on a path through an MP4 file, and the end of the last."""
+    """Offsets of the boxes on a path through an MP4 file, and the end of the last box."""
     begin, end, found = 0, len(content), []
     for kind in path:
         begin, end = next((b, e) for k, b, e in boxes(content, begin, end) if k == kind)
@@ -29,7 +29,7 @@ def find(content, *path):
 
 
 def with_durations(content, durations):
-    """An MP4 file with another duration of each frame, in units of its time scale."""
+    """An MP4 file with changed durations of the frames, in units of its time scale."""
     above, end = find(content, 'moov', 'trak', 'mdia', 'minf', 'stbl', 'stts')
     entries = b''.join(struct.pack('>II', 1, d) for d in durations)
     table = struct.pack('>I4sII', 16 + len(entries), b'stts', 0, len(durations)) + entries
@@ -43,7 +43,7 @@ def with_durations(content, durations):
 
 
 def turned(content, a, b, c, d, x, y):
-    """An MP4 file that is shown turned: its pixel (u, v) at (a u + c v + x, b u + d v + y)."""
+    """An MP4 file shown transformed: its pixel (u, v) at (a u + c v + x, b u + d v + y)."""
     (*_, begin), _ = find(content, 'moov', 'trak', 'tkhd')
     changed = bytearray(content)
     matrix = [x << 16 for x in (a, b, 0, c, d, 0, x, y)]
@@ -78,7 +78,7 @@ def test_times_of_a_variable_frame_rate(video):
     content = video.read_bytes()
     (*_, begin), _ = find(content, 'moov', 'trak', 'mdia', 'mdhd')
     (scale,) = struct.unpack_from('>I', content, begin + 20)
-    # Together as long as before: an edit list cuts off the rest.
+    # The total duration is unchanged, because an edit list cuts off the rest.
     units = [scale // 50 * x for x in (1, 1, 4, 1, 2, 1, 1, 6, 1, 2)]
     video.write_bytes(with_durations(content, units))
     frames, _ = read(video)
@@ -128,7 +128,7 @@ def test_display_matrix_of_damaged_and_other_files(video, tmp_path):
         path = tmp_path / 'damaged.mp4'
         path.write_bytes(damaged)
         assert display_matrix(path) is None
-    # Lengths of 64 bits, and a sound track before that of images.
+    # 64-bit lengths, and a sound track before the image track.
     (moov, *_), end = find(content, 'moov', 'trak')
     (_, trak), _ = find(content, 'moov', 'trak')
     sound = content[trak:end].replace(b'vide', b'soun')
@@ -164,7 +164,7 @@ def test_folder_is_read_in_the_order_of_numbers(folder, number_in):
 
 def test_jpeg_that_was_taken_turned_is_made_upright(folder):
     content = (folder / 'img_1.jpg').read_bytes()
-    # Orientation 6 of Exif: turn by 90 degrees clockwise.
+    # Exif orientation 6: rotate by 90 degrees clockwise.
     entry = struct.pack('<HHIHH', 0x0112, 3, 1, 6, 0)
     exif = b'Exif\0\0' + struct.pack('<2sHIH', b'II', 42, 8, 1) + entry + bytes(4)
     segment = b'\xff\xe1' + struct.pack('>H', 2 + len(exif)) + exif
@@ -199,7 +199,7 @@ def test_bad_sources(tmp_path, folder):
     ):
         with pytest.raises(ValueError, match=message):
             open_source(tmp_path / name, 1.0)
-    with pytest.raises(ValueError, match='give their rate by --fps'):
+    with pytest.raises(ValueError, match='give their rate with --fps'):
         read(folder)
     (folder / 'img_3.jpg').write_bytes((folder / 'img_3.jpg').read_bytes()[:200])
     with pytest.raises(ValueError, match=r'img_3\.jpg: jpeg of 200 bytes breaks off'):
@@ -223,7 +223,7 @@ BOMBS = {
 
 @pytest.mark.parametrize('name', BOMBS)
 def test_sizes_of_images_are_checked_before_memory_is_made(name, tmp_path):
-    """OpenCV reads its limit when it is loaded: in a process that begins with the package."""
+    """OpenCV reads its limit on import, so a new process imports the package first."""
     path = tmp_path / name
     path.write_bytes(BOMBS[name])
     program = f"""\

@@ -1,4 +1,4 @@
-"""Well-formed files of keypoints whose content nobody expects: a result, or one line."""
+"""Well-formed keypoint files with unexpected content: a result, or one error line."""
 
 import copy
 import json
@@ -83,7 +83,7 @@ CHOICES = tuple(
 
 
 def mutated(content, rng):
-    """A copy in which one to three values are strange, as often near the root as deep inside."""
+    """A copy with one to three strange values, equally often near the root and deep inside."""
     content = [copy.deepcopy(content)]
     for _ in range(rng.randint(1, 3)):
         entry, key = content, 0
@@ -95,7 +95,7 @@ def mutated(content, rng):
 
 
 def outcome(path, choice=CHOICES[0]):
-    """The error of a reading, '' where the keypoints are read; warnings are errors, too."""
+    """The error of reading, or '' on success; warnings are errors, too."""
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         try:
@@ -219,6 +219,6 @@ def test_arrays_whose_rows_cost_more_than_their_bytes(tmp_path):
     )
     assert 'holds object, wanted numbers or texts' in outcome(path)
     np.savez_compressed(path, pixels=np.ones((1, 2, 2)), landmark_names=np.ones(2))
-    assert 'other things than texts' in outcome(path)
+    assert 'entries that are not texts' in outcome(path)
     np.savez_compressed(path, pixels=np.ones((1_000_000, 0, 2)))
     assert 'records' in outcome(path)

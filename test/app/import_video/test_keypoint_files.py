@@ -12,14 +12,14 @@ IMAGE = np.zeros((4, 4, 3), np.uint8)
 
 
 class Numbered(FrameSource):
-    """Frames that have numbers and names; nobody looks at them."""
+    """Frames with numbers and names, but without images."""
 
     def frames(self, selection):
         return iter(())
 
 
 def pixels(n, number):
-    """(n, 2) px of a person in a frame."""
+    """Pixels (n, 2) of a person in a frame."""
     return np.stack([10.0 + np.arange(n), 20.0 + 2 * np.arange(n) + number], 1)
 
 
@@ -49,7 +49,7 @@ def write(path, content):
         (26, 'halpe26'),
         (33, 'mediapipe33'),
         (70, 'mhr70'),
-        # Bodies of lists with faces and hands.
+        # Body part of lists that also have faces and hands.
         (133, 'wholebody23'),
         (135, 'body25b'),
         (136, 'halpe26'),
@@ -69,7 +69,7 @@ def test_coco_results(n, scheme, tmp_path):
 
 
 def test_coco_annotations(tmp_path):
-    """Images and keypoints have names; flags say how well a keypoint is seen."""
+    """Images and keypoints have names; flags state the visibility of a keypoint."""
     content = {
         'images': [
             {'id': 70, 'file_name': 'b.jpg'},
@@ -166,7 +166,11 @@ def test_rows_far_from_a_frame_in_time_are_not_its(tmp_path):
     ('name', 'content', 'message'),
     [
         ('a.json', '{', 'not JSON'),
-        ('a.json', {'people': []}, 'entry 0 has no image_id or no keypoints: a file for each fr'),
+        (
+            'a.json',
+            {'people': []},
+            'entry 0 has no image_id or no keypoints: put files of single fr',
+        ),
         ('a.json', {'annotations': []}, 'no list images'),
         ('a.json', [1], 'entry 0 is not an object'),
         ('a.json', {'a': 1}, 'no known layout of JSON; wanted a list of'),
@@ -226,7 +230,7 @@ def test_bad_folders(tmp_path):
 
 
 def rows(n=17, number=2):
-    """(n, 3) column, row and confidence as JSON has them."""
+    """Column, row and confidence (n, 3) as in JSON."""
     return np.column_stack([pixels(n, number), np.full(n, 0.5)]).tolist()
 
 
@@ -294,7 +298,7 @@ def test_layouts_of_json(layout, tmp_path):
     ],
 )
 def test_labels_of_ultralytics(sure, tail, track, score, tmp_path):
-    """Fractions of the image; frames of a video count from 1, and other classes are no persons."""
+    """Fractions of the image; video frames count from 1; other classes are ignored."""
     folder = tmp_path / 'labels'
     folder.mkdir()
     for i in (1, 2):
@@ -347,7 +351,7 @@ Frame#\tTime\tRBigToe\t\t\tNeck\t\t
 
 
 def test_markers(tmp_path):
-    """Times count from the first row as they are; a Y that points up is turned."""
+    """Times are relative to the first row; a Y axis that points up is inverted."""
     for text in (MARKERS, MARKERS.replace('\t32', '\t-32').replace('\t52', '\t-52')):
         text = text if '-32' not in text else text.replace('\t42', '\t-42')
         (seen,) = found_in(write(tmp_path / 'walk.trc', text), time_ns=3_080_000_000)

@@ -16,7 +16,7 @@ def box(kind, *contents):
 
 
 def metadata(values, *, version=b''):
-    """A box with names and values, (type, bytes) by name, as QuickTime or with MP4's version."""
+    """A box of values, (type, bytes) by name, in QuickTime's form or with MP4's version."""
     names = [box(b'mdta', name) for name in values]
     keys = box(b'keys', struct.pack('>II', 0, len(names)), *names)
     items = [

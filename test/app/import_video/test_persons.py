@@ -13,7 +13,7 @@ def at(u, v=100.0, size=10.0, track='', score=1.0):
 
 
 def chosen(text, frames, numbers=None, **about):
-    """Left end of the box of the person in each frame, None without a box."""
+    """Left end of the chosen person's box in each frame, None without a box."""
     numbers = numbers or range(len(frames))
     found = FoundPersons(frames=dict(zip(numbers, frames)), **about)
     there = chosen_person(found, Choice.parse(text), rate=10.0)
@@ -31,7 +31,7 @@ def test_nearest_to_the_one_before():
 
 
 def test_nobody_is_nearest_who_is_far():
-    """A person 200 px away is another one, until there was time to go there."""
+    """A person 200 px away is another one until there was enough time to walk there."""
     frames = [[at(10.0)], [at(210.0)], [], [at(210.0)]]
     assert chosen('nearest', frames, [0, 1, 2, 40]) == [10.0, None, None, 210.0]
 
@@ -44,7 +44,7 @@ def test_place_and_track():
 
 
 def test_a_score_tells_who_is_a_person():
-    """A large box of a small score is nobody, in choices and in tracks."""
+    """A large box with a small score is no person, neither in choices nor in tracks."""
     frames = [[at(10.0 + i, score=0.93), at(12.0, size=60.0, score=0.011)] for i in range(3)]
     for text in ('largest', 'nearest', 'track:1', 'at:15,105'):
         assert chosen(text, frames) == [10.0, 11.0, 12.0], text
@@ -52,7 +52,7 @@ def test_a_score_tells_who_is_a_person():
 
 
 def test_at_a_point_and_a_time():
-    """From there on the person is followed both ways in time."""
+    """From there the person is followed forwards and backwards in time."""
     frames = [[at(10.0 + 2 * i), at(90.0 - 2 * i)] for i in range(20)]
     left, right = [10.0 + 2 * i for i in range(20)], [90.0 - 2 * i for i in range(20)]
     assert chosen('at:12,110', frames[:10]) == left[:10]

@@ -1,4 +1,4 @@
-"""Threads beside a replay: the same order, the same errors, and none left behind."""
+"""Background threads of a replay keep order and errors, and none is left running."""
 
 import threading
 
@@ -8,7 +8,7 @@ from hmt_ros.app.replay.one_bag import ReadAhead, WriteBehind
 
 
 def made(items):
-    """Items, errors among them raised."""
+    """Yields the items, and raises those that are errors."""
     for item in items:
         if isinstance(item, Exception):
             raise item

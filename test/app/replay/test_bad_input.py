@@ -1,4 +1,4 @@
-"""Whatever is wrong with the input: one line, exit code 1, and no bag."""
+"""For any wrong input: one error line, exit code 1, and no bag."""
 
 import os
 import subprocess
@@ -67,7 +67,7 @@ def keypoints(index, u, **fields):
 
 
 def write(folder, *entries):
-    """A bag of (topic, message), a hundredth of a second apart."""
+    """Writes a bag of (topic, message), a hundredth of a second apart."""
     with BagWriter(folder) as bag:
         for index, (topic, message) in enumerate(entries):
             bag.write(topic, START_NS + 10_000_000 * index, message)
@@ -75,7 +75,7 @@ def write(folder, *entries):
 
 
 def fails(bag, tmp_path, capsys, *options, subject=SUBJECT):
-    """The line that replay ends with."""
+    """The error line of replay."""
     file = tmp_path / 'subject.yaml'
     if subject is not None:
         file.write_text(subject)
@@ -165,7 +165,7 @@ def test_damaged_bags(tmp_path, capsys):
 
 
 def test_a_bag_that_a_crash_cut_off(tmp_path):
-    """Every command reads it up to its last complete message, and says so in one line."""
+    """Every command reads it up to its last complete message, and reports that in one line."""
     whole, cut = (REACH / 'reach.mcap').read_bytes(), tmp_path / 'cut.mcap'
     cut.write_bytes(whole[: len(whole) * 9 // 10])
 
@@ -236,7 +236,7 @@ def test_nobody_is_seen_without_a_start(tmp_path, capsys):
     assert main([str(bag), '-o', str(out)]) == 0
     told, line = capsys.readouterr().err.splitlines()
     assert told == 'replay: no --subject: the track starts from a pose_prediction with components'
-    assert 'nobody is found in its 1 images: give an image of the empty scene by' in line
+    assert 'nobody is found in its 1 images: give an image of the empty scene with' in line
     with BagReader(out) as written:
         (state,) = (stored.message.state for stored in written.messages(['keep_out']))
         assert state == KeepOutState.UNKNOWN
@@ -249,7 +249,7 @@ def test_nobody_is_seen_without_a_start(tmp_path, capsys):
         (['--bme', 'nowhere.npz'], 'nowhere.npz: no such model; wanted a file, or one of'),
         (['--bme', str(REACH / 'metadata.yaml')], 'metadata.yaml: '),
         (['--set', 'bme.magic=1'], 'there is no parameter magic'),
-        (['--set', 'bme.image_transport=raw'], 'is decided by replay'),
+        (['--set', 'bme.image_transport=raw'], 'is set by replay'),
         (
             ['--set', 'bme.stature=1.8', '--subject', str(REACH / 'subject.yaml')],
             '--set bme.stature=1.8: nothing is predicted without --bme',
@@ -283,7 +283,7 @@ def test_start_that_nothing_explains(good, tmp_path, capsys):
         (['--seed', 'x'], 'argument --seed: invalid int value'),
         (['--set', 'max_hypotheses'], '--set max_hypotheses: wanted NAME=VALUE'),
         (['--set', 'max_hypothesis=3'], 'there is no parameter max_hypothesis; is max_hypotheses'),
-        (['--set', 'image_transport=raw'], 'image_transport is decided by replay'),
+        (['--set', 'image_transport=raw'], 'image_transport is set by replay'),
         (['--set', 'body_model=['], '--set body_model=['),
         (['--image-topic', 'imag'], 'has no topic imag; it has /camera_info, /image'),
         (['--image-topic', 'camera_info'], 'CameraInfo, wanted CompressedImage or Image'),
@@ -305,7 +305,7 @@ def test_output_that_can_not_be_written(good, tmp_path, capsys):
 
 
 def test_going_on_nevertheless(tmp_path, capsys):
-    """A bag of which half is wrong is tracked where it is right, when that is asked for."""
+    """With --keep-going, the valid half of a bag is tracked."""
     out, bag = tmp_path / 'out', tmp_path / 'bag'
     with BagReader(REACH) as reader:
         pictures = [m.message for m in reader.messages(['image/compressed'])][:2]
@@ -321,7 +321,7 @@ def test_going_on_nevertheless(tmp_path, capsys):
     assert main([str(bag), *command]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith('(--keep-going skips such messages)')
-    # Nothing that follows the last messages: the bag breaks off.
+    # The bag is cut off after its last messages.
     (bag / 'bag.mcap').write_bytes(whole[:-2000])
     assert main([str(bag), *command, '--keep-going']) == 0
     streams = capsys.readouterr()

@@ -1,4 +1,4 @@
-"""replay, offline."""
+"""The command `replay`, offline."""
 
 import copy
 import sys
@@ -40,7 +40,7 @@ MESSAGES = RosbagsMessages()
 
 
 def recorded():
-    """(topic, log time, message) of the first images of a bag, with all that goes with them."""
+    """(topic, log time, message) of the first images of a bag, with all related messages."""
     found, last = [], None
     with BagReader(REACH) as bag:
         for stored in bag.messages():
@@ -49,7 +49,7 @@ def recorded():
                 last = stored.log_time_ns
                 if sum(topic == name for topic, _, _ in found) == IMAGES:
                     break
-            # Gravity is what the bags of these tests say of it.
+            # Gravity comes from the messages of each test.
             if name not in ('body', 'tf_static'):
                 found.append((name, stored.log_time_ns, stored.message))
     return [entry for entry in found if last is not None and entry[1] < last]
@@ -63,7 +63,7 @@ def write(folder, entries):
 
 
 def read(folder):
-    """Messages of a bag by the names of their topics, all of which are absolute."""
+    """Messages of a bag by topic name; all names are absolute."""
     found = {}
     with BagReader(folder) as bag:
         for stored in bag.messages():
@@ -77,7 +77,7 @@ def content(folder):
 
 
 class StandingStill:
-    """A tracker that costs nothing."""
+    """A stub tracker with a constant pose."""
 
     made = []  # noqa: RUF012
 
@@ -112,7 +112,7 @@ class StandingStill:
 
     @property
     def estimate(self):
-        """It is its own estimate, and its own modes."""
+        """The tracker itself, which also stands for its estimate and modes."""
         return self
 
     published = modes = estimate
@@ -157,7 +157,7 @@ def short(tmp_path_factory, entries):
 
 @pytest.fixture(scope='module')
 def replayed(short, tmp_path_factory):
-    """Tracked for good, without ROS."""
+    """A bag tracked with the real tracker, without ROS."""
     out = tmp_path_factory.mktemp('out') / 'tracked'
     with pytest.MonkeyPatch.context() as patch:
         for missing in ('rclpy', 'hmt_msgs', 'sensor_msgs'):
@@ -176,7 +176,7 @@ def test_topics(replayed, entries):
         # Windows are smoothed ten times a second.
         **dict.fromkeys(('trajectory_mixture', 'trajectory_markers'), 1),
     }
-    # Nobody has asked for any.
+    # Not requested.
     del counts['pose_forecast']
     assert {topic: len(messages) for topic, messages in found.items()} == {
         absolute_name(topic): count for topic, count in counts.items()
@@ -222,7 +222,7 @@ def test_mixtures_explain_the_images(replayed):
 
 
 def test_results_in_a_namespace(still, entries, tmp_path, capsys):
-    """Inputs keep their names; those in the namespace are preferred to those in the root."""
+    """Inputs keep their names; those in the namespace have priority over those in the root."""
     place = '/humans/bodies/anna'
     keypoints = MESSAGES.create(
         'hmt_msgs/msg/Keypoints2D',
@@ -272,7 +272,7 @@ def test_without_a_subject_a_prediction_starts_the_track(short, tmp_path, capsys
     assert {len(found[topic]) for topic in ('/pose_prediction', '/pose_mixture')} == {IMAGES}
     predicted = pose_mixture_of(found['/pose_prediction'][0].message)
     assert predicted.kind == MixtureKind.PREDICTION
-    # The person is about as large as the model says; the first images say a little.
+    # The person's lengths are close to the model's; the first images change them a little.
     model = load_predictor().body.segment_lengths
     bodies = [stored.message for stored in found['/body']]
     assert bodies
@@ -298,7 +298,7 @@ def test_images_are_copied_on_demand(still, short, tmp_path, entries):
     for topic in ('image/compressed', 'camera_info'):
         given = [(time, m.header) for name, time, m in entries if name == topic]
         assert [(s.log_time_ns, s.message.header) for s in found[f'/{topic}']] == given
-    # What came out can be tracked again.
+    # The result can be tracked again.
     assert main([str(out), '-o', str(tmp_path / 'again'), *SUBJECT, '--quiet']) == 0
     assert read(tmp_path / 'again').keys() == read(tmp_path / 'out').keys() - {
         '/image/compressed',
@@ -357,7 +357,7 @@ def packed(pixels, stamp):
     'parameter', ['use_keypoints', 'use_keypoints_3d', 'use_mask', 'use_depth']
 )
 def test_inputs_of_the_bag_are_used(still, entries, tmp_path, parameter):
-    """They are late, and come with the first image alone; --set switches each of them off."""
+    """Inputs arrive late, with the first image only; --set switches each of them off."""
     _, stamp, image = next(entry for entry in entries if entry[0] == 'image/compressed')
     shape = decode_image(image).shape[:2]
     person = np.zeros(shape, np.uint8)
@@ -420,12 +420,12 @@ def stamped(message, stamp):
 
 
 def test_times_of_recording_replace_missing_stamps(still, entries, tmp_path, capsys):
-    """Inputs go on belonging to the images that came before them with the same stamp."""
+    """Inputs still belong to the earlier images with the same timestamp."""
     times = sorted({time for topic, time, _ in entries if topic == 'image/compressed'})
     seen = [('keypoints', time, keypoints(time)) for time in times]
     given = sorted([*entries, *seen], key=lambda entry: entry[1])
     without = [(topic, time, stamped(message, 0)) for topic, time, message in given]
-    # A detector takes its time, and a clock may be wrong by a day.
+    # A detector needs some time, and a clock may be wrong by a day.
     later = {'keypoints': 5_000_000}
     wrong = [
         (topic, time + later.get(topic, 0), stamped(message, time - 86_400_000_000_000))
@@ -443,7 +443,7 @@ def test_times_of_recording_replace_missing_stamps(still, entries, tmp_path, cap
             command[2] = str(tmp_path / 'none')
             assert main(command) == 1
             (line,) = capsys.readouterr().err.splitlines()
-            assert 'on /image/compressed have no stamps (all are 0): --times log takes' in line
+            assert 'on /image/compressed have no stamps (all are 0): --times log uses' in line
     copied = {'/keypoints', '/ground_truth'}
     found = [
         [x.data for name, those in read(out).items() if name not in copied for x in those]
@@ -500,7 +500,7 @@ def test_the_bag_that_is_read_is_never_replaced(still, entries, tmp_path, capsys
     before = content(bag)
     for given in (bag, bag / 'bag.mcap'):
         assert main([str(given), '-o', str(bag), *SUBJECT, '--overwrite']) == 1
-        assert 'is the bag that is read' in capsys.readouterr().err
+        assert 'is the input bag' in capsys.readouterr().err
     assert content(bag) == before
 
 
@@ -517,7 +517,7 @@ def test_interruption_leaves_nothing(short, tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize('options', [[], ['--keep-going']])
 def test_full_disk(still, short, tmp_path, capsys, options):
-    """It is no fault of an image that could be passed over."""
+    """A full disk is not an error of an image that can be skipped."""
     with limited_file_size(20_000):
         assert main([str(short), '-o', str(tmp_path / 'out'), *SUBJECT, *options]) == 1
     (line,) = capsys.readouterr().err.splitlines()
@@ -526,7 +526,7 @@ def test_full_disk(still, short, tmp_path, capsys, options):
 
 
 def test_the_last_images_do_not_wait_for_what_a_bag_does_not_have(still, entries, tmp_path):
-    """Whatever the type of the detections: no message can say that there are no more."""
+    """For all types of detections, because no message can announce the end."""
     stamps = [time for topic, time, _ in entries if topic == 'image/compressed']
     layout = MESSAGES.create('std_msgs/msg/MultiArrayLayout', dim=[], data_offset=0)
     data = np.array([stamps[0] // 10**9, stamps[0] % 10**9, *[100.0, 100.0, 0.9] * 17], np.float32)

@@ -1,4 +1,4 @@
-"""replay --live: the real nodes give the bag that the offline run gives, byte for byte."""
+"""replay --live: the real nodes write the same bag as the offline run, byte for byte."""
 
 import sys
 from functools import partial
@@ -33,7 +33,7 @@ MESSAGES = RosbagsMessages()
 
 
 def recorded(images):
-    """(topic, log time, message) of the first images of a bag, with all that goes with them."""
+    """(topic, log time, message) of the first images of a bag, with all related messages."""
     found = []
     with BagReader(REACH) as bag:
         first = next(bag.messages(['image/compressed'])).log_time_ns
@@ -62,12 +62,12 @@ def messages(folder, topic):
 
 @pytest.fixture
 def in_one_process(monkeypatch):
-    """The nodes of live replays share a process, which starts in half the time of three."""
+    """Makes the nodes of live replays share a process, which starts faster than three."""
     monkeypatch.setattr(one_bag, 'LiveTrack', partial(LiveTrack, together=True))
 
 
 def both_ways(bag, tmp_path, capsys, *options, person=PERSON):
-    """The folders, and the exit codes and lines, of the same replay offline and live."""
+    """Folders, exit codes and lines of the same replay, offline and live."""
     folders, ends = [], []
     for how in ('offline', 'live'):
         out = tmp_path / how / 'out'
@@ -82,11 +82,11 @@ def both_ways(bag, tmp_path, capsys, *options, person=PERSON):
 def test_same_of_every_image_without_a_subject(tmp_path, capsys):
     """Each node in a process of its own.
 
-    What the BME predicts reaches the filter beside the image that it is from. It hears the track,
-    too: the second image comes 0.07 s after the first.
+    Predictions of the BME reach the filter with their image. The BME node also gets the track, so
+    the second image is 0.07 s after the first.
     """
     bag = write(tmp_path / 'bag', recorded(3))
-    # Filter and smoother tell of links on the same topic.
+    # Filter and smoother publish links on the same topic.
     options = ['--set', 'smoother.publish_tf=true', '--set', 'forecast_rate=50.0']
     options += ['--set', 'bme.tracked_interval=0.1']
     (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options, person=PERSON[2:])
@@ -101,7 +101,7 @@ def test_same_of_every_image_without_a_subject(tmp_path, capsys):
     with BagReader(offline) as bag_out:
         found = [len(x.message.components) > 0 for x in bag_out.messages(['pose_prediction'])]
     assert found == [True, False, True]
-    # What a robot acts on, too.
+    # Messages for robots, too.
     assert len(messages(offline, 'keep_out')) == 3
     assert len(messages(offline, 'pose_forecast')) > 3
     # And everything else.
@@ -137,7 +137,7 @@ def test_same_predictions_from_keypoints_and_silhouettes(tmp_path, capsys):
 
 @pytest.mark.usefixtures('in_one_process')
 def test_same_of_a_person_who_leaves_and_returns(tmp_path, capsys):
-    """One mixture without components, once, and a new track."""
+    """There is one mixture without components, then a new track."""
     entries, period = recorded(3), 10**9 // 15
     images = [(x[1], decode_image(x[2])) for x in entries if x[0] == 'image/compressed']
     empty = cv2.imread(str(REACH / 'background.png'))
@@ -161,7 +161,7 @@ def test_same_of_a_person_who_leaves_and_returns(tmp_path, capsys):
                 (stamps.index(stored.log_time_ns), len(stored.message.components))
                 for stored in bag_out.messages([topic])
             ]
-        # The person is there in 0 to 2 and from 11 on; who leaves or comes is watched for a while.
+        # The person is visible in 0 to 2 and from 11 on; changes are confirmed over some images.
         assert [index for index, _ in found] == [*range(9), 15, 16, 17, 18]
         assert [index for index, count in found if count == 0] == [8]
     for topic in ('human_joint_states', '/tf'):
@@ -172,7 +172,7 @@ def test_same_of_a_person_who_leaves_and_returns(tmp_path, capsys):
 
 @pytest.mark.usefixtures('in_one_process')
 def test_same_of_raw_images_with_keypoints_masks_and_faults(tmp_path, capsys):
-    """Keypoints and masks that come late, an image of another size, a time that jumps."""
+    """With late keypoints and masks, an image of another size, and a time jump."""
     entries = []
     for topic, time, message in recorded(3):
         if topic == 'image/compressed':
@@ -230,7 +230,7 @@ def parameters():
 
 
 class Nobody:
-    """A publisher that nobody hears."""
+    """A publisher without subscribers."""
 
     def publish(self, data):
         pass
@@ -250,7 +250,7 @@ def test_node_that_is_silent_or_dies_is_told(parameters, monkeypatch):
         running.process.kill()
         with pytest.raises(LiveNodeError, match='the filter node ended with code -9: '):
             track.take(IMAGE, entries['image/compressed'])
-        # It can not end well any more.
+        # The process can not end normally any more.
         monkeypatch.setattr(running, 'stop', lambda: 0)
 
 

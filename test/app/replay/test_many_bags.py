@@ -1,4 +1,4 @@
-"""replay of many bags: what is skipped, what is done again, and the same bytes through Dask."""
+"""replay of many bags: skipped bags, repeated bags, and the same bytes through Dask."""
 
 import io
 import json
@@ -29,7 +29,7 @@ def archive(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def tracked(archive, tmp_path_factory):
-    """The new bags, one after the other, of which nothing is said."""
+    """Folder of the new bags, made one after the other, without output."""
     out, said = tmp_path_factory.mktemp('out') / 'tracked', io.StringIO()
     with redirect_stdout(said), redirect_stderr(said):
         assert main([str(archive), '-o', str(out), '--quiet', *PERSON]) == 0
@@ -55,7 +55,7 @@ def test_every_bag_gets_one_of_its_name(archive, tracked, tmp_path):
         assert record['done'] is True
         assert (record['images'], record['tracked']) == (2, 2)
         assert record['made_from']['parameters']['filter']['subject_file'].startswith('sha256:')
-    # As alone.
+    # The same as a single replay.
     alone = [str(archive / 'a'), '-o', str(tmp_path / 'a'), '--quiet', *PERSON]
     assert main(alone) == 0
     assert (tmp_path / 'a' / 'a.mcap').read_bytes() == (tracked / 'a' / 'a.mcap').read_bytes()
@@ -67,7 +67,7 @@ def test_bags_that_are_done_are_skipped(archive, tracked, monkeypatch, capsys):
 
     before = {path: path.stat().st_mtime_ns for path in tracked.rglob('*')}
     monkeypatch.setattr(many_bags, 'replay_bag', never)
-    # Named one by one they are the same bags.
+    # Listing the bags gives the same results.
     one_by_one = [str(archive / 'a'), str(archive / 'day')]
     assert main([str(archive), '-o', str(tracked), *PERSON]) == 0
     assert capsys.readouterr().out.splitlines() == [
@@ -76,7 +76,7 @@ def test_bags_that_are_done_are_skipped(archive, tracked, monkeypatch, capsys):
         f'{tracked}: 0 replayed, 2 done before, 0 failed',
     ]
     assert {path: path.stat().st_mtime_ns for path in tracked.rglob('*')} == before
-    # With other parameters they are not, and are not replaced unasked.
+    # With other parameters they differ, and are not replaced without --overwrite.
     assert main([*one_by_one, '-o', str(tracked), *PERSON, '--seed', '1', '--quiet']) == 1
     streams = capsys.readouterr()
     assert streams.out == ''
@@ -95,7 +95,7 @@ def test_what_was_left_half_done_is_done_anew(archive, tracked, tmp_path, monkey
     begun = []
 
     def killed(source, target, options, tell, **shown):
-        """Leaves what a process leaves that is killed in its second bag."""
+        """Leaves the files of a process that is killed in its second bag."""
         if begun:
             folder = target.with_name(f'.{target.name}.0123abcd.partial') / target.name
             folder.mkdir(parents=True)
@@ -116,7 +116,7 @@ def test_what_was_left_half_done_is_done_anew(archive, tracked, tmp_path, monkey
     ]
     assert content(tmp_path / 'out') == wanted
     assert list((tmp_path / 'out').rglob('.*')) == []
-    # A bag that is not as it was left is done again as well.
+    # A changed bag is made again, too.
     (tmp_path / 'out' / 'a' / 'a.mcap').write_bytes(b'')
     assert main(command) == 0
     assert capsys.readouterr().out.startswith('a: 2 of 2 images tracked')
@@ -148,7 +148,7 @@ def test_any_exception_in_one_of_many_is_one_line(
         raise KeyError('\x1b[2J\n' + 1000 * 'long ')
 
     if scheduler:
-        # A worker is another process: the fault is of what comes to it.
+        # A worker is another process, so the fault must be in its input.
         pytest.importorskip('distributed')
         monkeypatch.setattr(many_bags, '_replay_in_worker', fail)
     monkeypatch.setattr(many_bags, 'replay_bag', fail)
@@ -168,7 +168,7 @@ def test_what_can_not_be_begun(archive, tmp_path, monkeypatch, capsys):
     out = tmp_path / 'out'
     a, b = archive / 'a', archive / 'day' / 'b'
     assert '--live replays one bag at a time' in fails(a, b, '-o', out, '--live')
-    assert 'is the folder that is read' in fails(archive, '-o', archive)
+    assert 'is the input folder' in fails(archive, '-o', archive)
     (tmp_path / 'empty').mkdir()
     assert 'empty has no bags in it' in fails(tmp_path / 'empty', a, '-o', out)
     (tmp_path / 'copy').mkdir()
@@ -197,6 +197,6 @@ def test_through_dask_the_bags_are_the_same(archive, tracked, tmp_path, capfd):
     (line,) = streams.err.splitlines()
     assert line.startswith('replay: nowhere: ')
     assert content(out) == content(tracked)
-    # What one way has done the other way need not do.
+    # Bags made in one way are not made again in the other.
     assert main([*command[:1], *command[2:]]) == 0
     assert 'day/b: done before' in capfd.readouterr().out

@@ -1,4 +1,4 @@
-"""Two people from a bag into a bag."""
+"""Two people: from a bag with images to a bag with results."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def test_a_bag_of_two_people(crossing):
     assert all(person.name == '' for found in people for person in found)
     assert {len(found) for found in people} <= {1, 2}
     assert sum(len(found) == 2 for found in people) > 18
-    # Neither the order nor the number of joints tells who is who.
+    # Neither the order nor the number of joints identifies the people.
     first = [found[0].keypoints.pixels[found[0].keypoints.seen, 0].mean() for found in people[:8]]
     assert np.ptp(first) > 60
     hidden = min(person.keypoints.seen.sum() for found in people for person in found)
@@ -45,7 +45,7 @@ def test_a_bag_of_two_people(crossing):
 
 
 def nearest_person(truths, bag, name, chosen):
-    """The person that a track is nearest to in most of some images, and the track's images."""
+    """The person whom a track is nearest to in most of the chosen images, and its images."""
     votes, stamps = [], set()
     for stored in bag.messages([f'/humans/bodies/{name}/pose_mixture']):
         found = pose_mixture_of(stored.message)

@@ -32,7 +32,7 @@ def camera_place(stamp, parent, child):
 
 
 def with_transforms(entries):
-    """The entries with a robot that stands at the origin, a bit before and after the images."""
+    """The entries with transforms of a robot at the origin, from before to after the images."""
     images = [x for x in entries if x[0] == 'image/compressed']
     frame = str(images[0][2].header.frame_id)
     times = [images[0][1], *(time + 1_000_000 for _, time, _ in images)]
@@ -77,7 +77,7 @@ def test_ground_is_that_of_the_frame(replayed):
         time_ns(stored.message.header.stamp) for stored in found['/pose_mixture']
     ]
     for ground in grounds:
-        # Lines refine it within the deviation of a sensor.
+        # Lines in the image refine it within the deviation of a sensor.
         np.testing.assert_allclose(ground.up, VIEW.rotation[:, 2], atol=3e-3)
         assert ground.height == pytest.approx(1.25, abs=0.05)
 
@@ -111,7 +111,7 @@ def test_a_frame_with_z_up_is_used_by_itself(moving, entries, tmp_path, capsys):
     assert capsys.readouterr().err.count('gravity and the motion of the camera: from world') == 2
     ground = ground_of(read(tmp_path / 'by_itself')['/ground'][0].message)
     np.testing.assert_allclose(ground.up, VIEW.rotation[:, 2], atol=3e-3)
-    # A direction that is given comes first.
+    # A given direction has priority.
     arguments = [str(moving), '-o', str(tmp_path / 'given'), *PERSON, *SMALL]
     assert main([*arguments, '--set', 'gravity=[0, 1, 0]', '--no-smoother', '--quiet']) == 0
     ground = ground_of(read(tmp_path / 'given')['/ground'][0].message)
@@ -158,7 +158,7 @@ def test_new_bag_has_what_was_used(replayed, moving, tmp_path):
 
 
 def test_fixed_frame_of_a_camera_that_stands_still(replayed, moving, tmp_path):
-    """A camera that does not move in the fixed frame is as one of which nothing is told."""
+    """A camera at rest in the fixed frame gives the same results as without a fixed frame."""
     out = tmp_path / 'out'
     arguments = [str(moving), '-o', str(out), *PERSON, *SMALL, *FRAME, '--set', 'fixed_frame=world']
     assert main([*arguments, '--no-smoother', '--quiet']) == 0

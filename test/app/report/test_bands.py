@@ -87,7 +87,7 @@ def test_the_page_has_the_bands_of_filter_and_smoother(made, body, poses, tmp_pa
     assert bands['smoothed']['joints'] + bands['smoothed']['angles'] == names
     values = numbers(bands['smoothed']['values'], (FRAMES, len(names), 3))
     assert (np.diff(values, axis=-1) > 0).all()
-    # Modes err by about 0.1 rad or m: the truth is in the intervals or near.
+    # Modes err by about 0.1 rad or m, so the truth is in the intervals or near them.
     true = body.joint_positions(poses) @ UP + 1.5
     found = 1e-3 * values[:, : len(body.joint_names), 1]
     assert np.abs(found - true).mean() < 0.15

@@ -1,4 +1,4 @@
-"""The command report: what stands in its page."""
+"""The command report: content of its page."""
 
 import base64
 import re
@@ -40,7 +40,7 @@ def positions(data, text, *shape):
     return np.array(data['origin']) + data['step'] * integers(text).reshape(*shape, 3)
 
 
-# What stands in the page.
+# Content of the page.
 
 
 @pytest.mark.parametrize('topic', ['/pose_mixture', '/smoothed_pose_mixture'])
@@ -60,7 +60,7 @@ def test_modes_are_those_of_the_bag(made, data, body, topic):
 
 
 def with_beliefs(message):
-    """A mixture that tells, if it is a posterior, what is believed; of depth not the last."""
+    """A mixture that, if a posterior, has reliabilities of cues; the last one lacks depth."""
     if message.kind == MixtureKind.POSTERIOR:
         i = STAMPS.index(time_ns(message.header.stamp))
         message.existence_probability = 1.0 - 0.1 * i
@@ -175,7 +175,7 @@ def test_chosen_topics_and_fewer_times(made, tmp_path):
 
 @pytest.mark.usefixtures('no_pictures')
 def test_bag_in_a_namespace(body, poses, tmp_path):
-    """The topics of a person are found in the person's namespace; a relative name is enough."""
+    """Topics are found in a person's namespace; a relative name is enough."""
     place = '/humans/bodies/anna'
     out = write_out(tmp_path / 'out', body, poses, overlay=True, namespace=place)
     found = data_of(make(out, tmp_path / 'report', '--topic', 'pose_mixture'))
@@ -186,7 +186,7 @@ def test_bag_in_a_namespace(body, poses, tmp_path):
 
 @pytest.mark.usefixtures('no_pictures')
 def test_images_without_anybody(made, body, poses, tmp_path, capsys):
-    """Every image that was answered is shown; of nobody at all, too."""
+    """Every answered image is shown, also if no image has a person."""
     answered = [STAMPS[0] - 100_000_000, *STAMPS]
     nobody = tmp_path / 'nobody'
     somebody = write_out(tmp_path / 'some', body, poses, truth=False)
@@ -194,7 +194,7 @@ def test_images_without_anybody(made, body, poses, tmp_path, capsys):
         bag.add_topic('pose_mixture', POSE_MIXTURE)
         for stamp in answered:
             bag.write('keep_out', stamp, keep_out(stamp, reason='no scene'))
-        # Of a time without an image.
+        # For a time without an image.
         bag.write('keep_out', STAMPS[-1] + 1, keep_out(STAMPS[-1] + 1, KeepOutState.STALE))
     images = write_images(tmp_path / 'images', answered)
     found = data_of(make(nobody, tmp_path / 'first', '--images', images, '--truth', made.truth))
@@ -234,7 +234,7 @@ def test_text_from_outside_stays_text(body, poses, made, tmp_path):
     assert '</script><b>' in data_of(page)['layers'][0]['joints']
 
 
-# How large it gets.
+# Size of the page.
 
 
 def noise(width, height):
@@ -249,7 +249,7 @@ def test_images_get_smaller_until_they_fit(each, tmp_path):
     assert sum(len(jpeg) for jpeg in strip.jpegs.values()) <= each * FRAMES
     assert strip.size == (640, 480)
     assert strip.kept[STAMPS[2]].shape == (480, 640, 3)
-    # Where even the smallest are too large, some are left out.
+    # If even the smallest images are too large, some are left out.
     assert (len(strip.jpegs) == FRAMES) == (each > 1_500)
 
 
@@ -261,11 +261,11 @@ def test_times_are_left_out_where_the_data_get_too_large(made, tmp_path, monkeyp
     assert len(data['times']) == 3
 
 
-# What goes wrong.
+# Errors.
 
 
 def fails(tmp_path, capsys, out, *options):
-    """The line that the command ends with; nothing may be written."""
+    """The error line of the command, which must not write anything."""
     target = tmp_path / 'new' / 'report'
     assert report.main([str(out), '-o', str(target), *map(str, options)]) == 1
     captured = capsys.readouterr()
@@ -304,7 +304,7 @@ def test_mixtures_that_can_not_be_understood(body, poses, tmp_path, capsys):
         return message
 
     out = write_out(tmp_path / 'elsewhere', body, poses, change=elsewhere, truth=False)
-    assert 'name those of one camera by --topic' in fails(tmp_path, capsys, out)
+    assert 'name those of one camera with --topic' in fails(tmp_path, capsys, out)
 
 
 @pytest.mark.usefixtures('no_pictures')
@@ -345,7 +345,7 @@ UP = np.array([0.0, -0.8, -0.6])
 
 
 def with_ground(path, body, poses, *, frame=FRAME_ID, height=1.5, topics=('ground',), spoil=None):
-    """A bag of mixtures with messages about the floor, of which the first image has none."""
+    """A bag of mixtures with messages about the floor for all images except the first."""
 
     def message(stamp):
         contacts = {'left_foot': 0.9, 'right_foot': 0.1}

@@ -20,7 +20,7 @@ HIDDEN = 'left_wrist'
 
 
 def landmarks(joints, names):
-    """Where a detector whose landmarks are exactly at the joints sees them, from its own origin."""
+    """3D landmarks of a detector exactly at the joints, relative to its own origin."""
     marks = schemes()['mediapipe33'].landmarks
     places = np.zeros((len(marks), 3))
     for i, mark in enumerate(marks):
@@ -31,7 +31,7 @@ def landmarks(joints, names):
 
 
 def with_detector(path, source, body, poses, *, topics=('keypoints_3d',), spoil=None, nobody=False):
-    """A bag with positions in space: not in the first image, and without a wrist in the third."""
+    """A bag with 3D positions: none in the first image, no wrist in the third."""
     with BagReader(source) as bag, BagWriter(path) as result:
         for stored in bag.messages():
             result.write(stored.topic, stored.log_time_ns, stored.message)

@@ -1,4 +1,4 @@
-"""The page of a report: what it does in a browser."""
+"""The page of a report: its behaviour in a browser."""
 
 import html
 import json
@@ -33,7 +33,7 @@ in_a_browser = pytest.mark.skipif(
     BROWSER is None, reason=f'no Chromium is installed: looked for {", ".join(BROWSERS)}'
 )
 
-# Before anything else in the page: what it complains about.
+# Inserted first in the page; records errors.
 COMPLAINTS = """<script>
 const complaints = [];
 const complain = (...words) => complaints.push(words.join(' '));
@@ -43,7 +43,7 @@ const complain = (...words) => complaints.push(words.join(' '));
 ));
 </script>
 """
-# After everything else: what a person does, and what is seen then.
+# Inserted last in the page; performs a user's actions and records the results.
 VISIT = """<script>
 const seen = {};
 function pixelsOf(id) {
@@ -92,7 +92,7 @@ visit().catch((error) => complaints.push(`visit: ${error}`)).finally(() => {
 
 
 def visit(page, steps, folder, fragment=''):
-    """What a browser sees that opens the page from its file and takes some steps."""
+    """Results of steps in a browser that opens the page from its file."""
     path = folder / 'visited.html'
     path.write_text(
         page.replace('<head>\n', f'<head>\n{COMPLAINTS}', 1).replace(
@@ -194,7 +194,7 @@ def test_layers_modes_and_play(page, tmp_path):
         """,
         tmp_path,
     )
-    # Beside a truth.
+    # With a truth.
     assert seen['onPelvis'] is True
     views = ['first', 'both', 'without truth', 'ways', 'aligned', 'alone']
     assert len({seen[name] for name in views}) == len(views)
@@ -229,7 +229,7 @@ def test_floor_and_contacts_are_drawn(body, poses, tmp_path):
     assert 'does not tell the floor' in seen[0]['caption']
     assert 'The grid is the floor' in seen[1]['caption']
     assert seen[0]['space'] != seen[1]['space']
-    # -0.8 y - 0.6 z + 1.5 = 0 at x = 1 and z = 2; the page turns y and z round.
+    # -0.8 y - 0.6 z + 1.5 = 0 at x = 1 and z = 2; the page negates y and z.
     assert abs(seen[1]['floor'] + (1.5 - 0.6 * 2) / 0.8) < 1e-6
 
 
@@ -313,7 +313,7 @@ def test_keys_buttons_detector_regions_and_shadow(made, body, poses, tmp_path):
     assert seen['shadow'] > 500
     assert seen['no shadow'] == 0
     assert len(seen['reached']) == len(body.joint_names)
-    # Of the pelvis relative to itself all is known; perspective bends an ellipse a little.
+    # The pelvis relative to itself has no uncertainty; perspective bends an ellipse a little.
     assert seen['reached'][0] is None
     assert all(0.97 < most < 1.03 for most in seen['reached'][1:])
 
@@ -338,12 +338,12 @@ def test_a_phone_shows_all_of_it(page, tmp_path):
     """
     width, room, bottom, height = visit(outer, steps, tmp_path)['told']
     assert width == room <= 360
-    # Where time is chosen stays in view.
+    # The time control stays in view.
     assert 0 < bottom < height == 740
 
 
 def with_identities(message):
-    """Modes of two motions, which change places in every other image."""
+    """Modes of two motions, with their order swapped in every other image."""
     swapped = message.header.stamp.nanosec // 100_000_000 % 2
     for k, component in enumerate(message.components):
         component.id = (5 if k == swapped else 8) if k < 2 else 0
@@ -366,7 +366,7 @@ def test_filter_and_smoother_are_drawn_side_by_side(page, made, tmp_path):
     views = ['first', 'beside', 'over each other']
     assert len({seen[name] for name in views}) == len(views)
     assert seen['both again'] == seen['beside']
-    # Without the smoother there is nothing beside the filter.
+    # Without the smoother only the filter is shown.
     assert seen['filter alone'] == seen['first']
     given = visit(page, "look('beside');", tmp_path, '#show=0,1,truth,beside')
     assert given['beside'] == seen['beside']

@@ -64,7 +64,7 @@ def test_specks_are_nobody() -> None:
 def test_of_several_blobs_the_largest_person_is_used_and_it_is_said() -> None:
     mask = np.zeros((200, 640), bool)
     figure(mask, 100, 50)
-    mask[10:190, 300:420] = True  # a full rectangle: larger, but nobody has that shape
+    mask[10:190, 300:420] = True  # a full rectangle: larger, but not shaped like a person
     mask[180:190, 440:640] = True  # long as a cable
     blob = person_blob(mask)
     assert blob.box == (99.5, 49.5, 159.5, 149.5)

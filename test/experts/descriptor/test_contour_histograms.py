@@ -102,8 +102,8 @@ def test_edge_pairs_are_a_histogram() -> None:
 
 def test_both_sides_of_a_limb_run_against_each_other() -> None:
     table = described(rectangle(200, 30)).reshape(PAIR_DISTANCES, PAIR_ANGLES)
-    # Two edges of one side run alike, of opposite sides against each other; but for the ends there
-    # is no other angle.
+    # Edges of one side are parallel, those of opposite sides antiparallel; except at the ends there
+    # are no other angles.
     assert table[:, -1].sum() > 0.35
     assert table[:, 0].sum() > 0.35
     assert table[:, [0, -1]].sum() > 0.75
@@ -119,7 +119,7 @@ def test_rotation_place_and_size_hardly_change_edge_pairs() -> None:
 
 
 def test_pairs_across_a_gap_do_not_count() -> None:
-    # Two bars beside each other: what connects one with the other leaves the silhouette.
+    # Two bars side by side: connections between them leave the silhouette.
     two = np.zeros((200, 120), np.uint8)
     two[10:190, 10:40] = 1
     two[10:190, 80:110] = 1

@@ -19,7 +19,7 @@ def edges_of(grey: np.ndarray, mask: np.ndarray = MASK) -> np.ndarray:
 
 
 def test_a_person_of_one_colour_has_none() -> None:
-    """Whatever is behind."""
+    """This holds for any background."""
     for behind in (0, 255):
         grey = np.full(MASK.shape, behind)
         grey[MASK > 0] = 120

@@ -126,7 +126,7 @@ def test_one_silhouette_is_too_few(masks: np.ndarray) -> None:
 
 
 def test_the_centred_view_undoes_place_and_lens() -> None:
-    """The same person on the axis, and aside through a distorting lens."""
+    """The same person on the axis, and off axis through a distorting lens."""
     from hmt_ros.experts.pose_encoding import PoseEncoding
 
     body = load_body('human37')

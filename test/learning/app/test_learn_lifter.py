@@ -1,4 +1,4 @@
-"""The command that learns experts of depth: what it refuses before it learns."""
+"""The command that learns experts of depth: what it refuses before learning."""
 
 import pytest
 

@@ -42,7 +42,7 @@ def test_motions_give_a_motion_prior(tmp_path, read_here, capsys):
     assert learned.card['source'] == 'From nobody.'
     assert (len(learned.card['motions']), learned.card['seconds']) == (2, 7)
     assert learned.dynamics.dimension == 37
-    # The same in one process.
+    # The result is the same in one process.
     read_here()
     again = tmp_path / 'again.npz'
     assert learn.main(['motion', *arguments, '-o', str(again), '--quiet']) == 0

@@ -1,4 +1,4 @@
-"""The command on a handful of short motions of a stick figure."""
+"""`learn prior` on a few short motions of a stick figure."""
 
 import numpy as np
 import pytest
@@ -58,13 +58,13 @@ def test_the_command_learns_chooses_and_tells(folder, tmp_path, read_here, capsy
     prior = read_pose_prior(output, body)
     assert prior.card['source'] == 'stick figures'
     assert 'people: lab_00, lab_01, lab_02' in prior.card['method']
-    # Hands that do not move are not learned, and nothing of the root.
+    # Neither hands that do not move nor the root are learned.
     assert {'left_elbow', 'right_knee', 'trunk_x'} <= set(prior.dofs)
     assert not any('root' in name or 'wrist' in name for name in prior.dofs)
     x = np.tile(body.prior_mean, (5, 1))
     x[:, 6:] += 0.3 * np.random.default_rng(0).normal(size=(5, 31))
     assert np.allclose(prior.log_density(x), prior.log_density(mirror(body, x)), atol=1e-6)
-    # The same again, in one process, gives the same bytes; nothing is replaced unasked.
+    # A second run, in one process, gives the same bytes; nothing is overwritten unasked.
     read_here()
     again = tmp_path / 'again'
     assert learn.main(['prior', *rest, '--quiet', '-o', str(again)]) == 0

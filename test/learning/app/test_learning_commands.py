@@ -1,4 +1,4 @@
-"""The commands of hmt_learning explain themselves; bad arguments are one line."""
+"""The commands of hmt_learning have help texts and report bad arguments in one line."""
 
 import pytest
 

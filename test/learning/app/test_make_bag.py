@@ -89,7 +89,7 @@ def test_depth_is_what_a_sensor_measures(tmp_path, content):
 
 
 def test_the_place_of_the_camera_is_told_as_a_robot_does(content, truth):
-    """The transform, and gravity and height in the truth, say the same."""
+    """The transform agrees with gravity and height in the truth."""
     buffer = TransformBuffer()
     assert buffer.put(content['tf_static'][0], static=True) == []
     place = buffer.lookup('odom', 'camera_optical_frame', 0)
@@ -197,7 +197,7 @@ def test_recorded_motion(file, tmp_path):
 
 
 def test_bags_of_the_repository(tmp_path, content):
-    """What lies in bags/ is what its README says."""
+    """The bags in bags/ are reproduced by the commands in its README."""
     readme = (ROOT / 'bags' / 'README.md').read_text()
     lines = [line.split() for line in readme.splitlines() if 'hmt_learning make-bag' in line]
     rendered = [line.split()[-1] for line in readme.splitlines() if 'demonstration.sh' in line]
@@ -220,7 +220,7 @@ def test_bags_of_the_repository(tmp_path, content):
             assert np.array_equal(new[name], old[name])
         for name in ('poses', 'joints', 'pixels', 'K'):
             assert np.allclose(new[name], old[name], atol=1e-5)
-        # Other versions of numpy and OpenCV may round otherwise.
+        # Other versions of numpy and OpenCV may round differently.
         assert np.mean(new['masks'] != old['masks']) < 1e-4
         pictures = []
         for folder in (made, kept):

@@ -80,7 +80,7 @@ def test_broken_motions_are_skipped_and_counted(
     assert '1 motions, 3 skipped' in captured.out
     assert len(PosePredictor.load(output).notes['motions']) == 1
     read_here()
-    # People are left out by their names, and others are what it is scored on.
+    # People are left out by name, and other people are the test set.
     more = ['--without', 'broke*', '--test', str(folder / 'deeper'), '--overwrite']
     assert train.main([*arguments, *more]) == 0
     assert '1 motions, 2 skipped' in capsys.readouterr().out
@@ -118,7 +118,10 @@ def test_bad_input_is_one_line(tmp_path, read_here, capsys):
         (['-o', output, '--mocap', str(empty)], 'has no motion'),
         (['-o', output, '--mocap', str(tmp_path / 'absent')], 'wanted a folder or a motion'),
         (['-o', output, '--motions', 'swim'], "no motion 'swim'"),
-        (['-o', str(tmp_path / 'x' / 'm.npz'), '--motions', 'walk'], 'its folder is no place'),
+        (
+            ['-o', str(tmp_path / 'x' / 'm.npz'), '--motions', 'walk'],
+            'its folder is missing or not',
+        ),
         (['-o', output, '--motions', 'walk', '--samples', '3'], 'from 50'),
         (['-o', output, '--motions', 'walk', '--body', 'nobody'], 'nobody'),
         (['--motions', 'walk'], '-o'),

@@ -1,4 +1,4 @@
-"""Iterative inverse kinematics against known poses, finite differences and dense algebra."""
+"""Iterative inverse kinematics, compared with known poses, differences and dense algebra."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def near(body, poses, spread, seed):
 
 
 def inner_poses(body, count, seed):
-    """Poses well inside the limits, elbows and knees bent: the joints tell all angles."""
+    """Poses well inside the limits, with bent elbows and knees, so joints determine all angles."""
     rng = np.random.default_rng(seed)
     low, high = np.maximum(body.lower, -1.0), np.minimum(body.upper, 1.0)
     poses = 0.5 * (low + high) + 0.25 * (high - low) * rng.uniform(-1, 1, (count, body.dimension))
@@ -53,12 +53,12 @@ def test_recovers_poses_from_joints(body):
     found = solve_joint_positions(body, near(body, truth, 0.15, 1), joints, prior_weight=1e-9)
     assert np.abs(body.joint_positions(found.x) - joints).max() < 1e-5
     assert found.value.max() < 1e-4
-    # The head and the hands do not turn about themselves: the joints fix all angles.
+    # Head and hands do not twist, so the joints determine all angles.
     assert np.abs(found.x - truth).max() < 1e-3
 
 
 def test_derivatives_at_the_start_are_those_of_the_energy(body):
-    """Without a step the start comes back, with its value, gradient and Hessian."""
+    """Without steps the result is the start, with its value, gradient and Hessian."""
     poses = inner_poses(body, 3, 2)
     rng = np.random.default_rng(3)
     targets = body.joint_positions(poses) + 0.05 * rng.normal(size=(3, len(body.joint_names), 3))
@@ -107,7 +107,7 @@ def test_the_minimum_is_one(small):
 
 
 def test_joints_that_do_not_matter(small):
-    """NaN is the same as not naming a joint."""
+    """NaN has the same effect as omitting a joint."""
     truth = inner_poses(small, 3, 6)
     start = near(small, truth, 0.1, 7)
     joints = small.joint_positions(truth)
@@ -124,7 +124,7 @@ def test_joints_that_do_not_matter(small):
 
 
 def test_limits_hold(small):
-    """A forearm asked to bend backwards stays straight."""
+    """A forearm with a target behind its limit stays straight."""
     pose = np.zeros((1, small.dimension))
     pose[0, 2] = 3.0
     elbow = small.dof_names.index('left_elbow')
@@ -152,7 +152,7 @@ def test_what_does_not_fit_is_refused(small):
 
 
 def test_targets_along_rays_leave_the_distance_free():
-    """The joints come onto the rays; how far away they are does not count."""
+    """The joints move onto the rays, at any distance."""
     body = load_body('human34')
     start = np.tile(body.prior_mean, (4, 1))
     start[:, :3] = [0.0, 0.1, 3.0]

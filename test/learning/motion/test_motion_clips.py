@@ -1,4 +1,4 @@
-"""Every development motion against a plain evaluation of its file, and against the index."""
+"""Every development motion, compared with a plain evaluation of its file and the index."""
 
 import csv
 import re
@@ -8,7 +8,7 @@ import pytest
 
 from hmt_learning.motion.motion_file import read_motion
 
-FRAMES = 6  # of each clip are evaluated the plain way
+FRAMES = 6  # number of frames of each clip for the plain evaluation
 
 
 @pytest.fixture(scope='module')
@@ -42,7 +42,7 @@ def shift(v):
 
 
 def plain_bvh(path, frames):
-    """Joint positions by name, file units; nested 4 x 4 products down the hierarchy."""
+    """Joint positions by name, file units, by nested 4 x 4 products along the hierarchy."""
     header, motion = path.read_text().split('MOTION')
     rows = motion.strip().splitlines()[2:]
     values = np.array([[float(x) for x in rows[f].split()] for f in frames])
@@ -83,7 +83,7 @@ def plain_bvh(path, frames):
 
 
 def plain_amc(path, frames):
-    """Joint positions by name of the bone that starts there, file units."""
+    """Joint positions by name of the bone that starts at each, file units."""
     text = path.with_suffix('.asf').read_text()
     bones = {}
     for block in re.findall(r'begin\s+id(.*?)end', text, re.DOTALL):
@@ -155,7 +155,7 @@ def test_every_clip_has_the_standard_joints_and_limbs(clips):
         }  # fmt: skip
         place = dict(zip(sorted(standard), motion.joint_positions(sorted(standard)).mean(0)))
         assert place['head'][2] > place['neck'][2] > place['pelvis'][2] > place['left_knee'][2]
-        # Facing: with z up, left is to the left of where the toes point.
+        # Facing: with z up, the left side is to the left of the toes' direction.
         for side in ('left', 'right'):
             ahead = place[f'{side}_toe'] - place[f'{side}_ankle']
             across = place[f'{side}_hip'] - place['pelvis']

@@ -1,4 +1,4 @@
-"""BVH and ASF/AMC: what small files mean, and one line for files that are broken."""
+"""BVH and ASF/AMC: content of small files, and one error line for broken files."""
 
 import contextlib
 from itertools import pairwise
@@ -96,7 +96,7 @@ def write(folder, name, text):
 
 @pytest.fixture
 def rod(tmp_path):
-    """Path of an AMC with its ASF beside it."""
+    """Path of an AMC in the same folder as its ASF."""
     write(tmp_path, 'rod.asf', ASF)
     return write(tmp_path, 'rod.amc', AMC)
 
@@ -141,7 +141,7 @@ def test_every_up_axis_is_turned_up_by_a_rotation(axis):
 
 def test_asf_and_amc_by_hand(rod):
     motion = read_motion(rod)
-    assert motion.unit_to_m == pytest.approx(0.0508)  # inches over 0.5
+    assert motion.unit_to_m == pytest.approx(0.0508)  # inches / 0.5
     assert motion.fps == 120.0
     body = motion.body
     assert body.joint_names == ('root', 'upper', 'lower', 'lower_end')
@@ -167,7 +167,7 @@ def test_asf_and_amc_by_hand(rod):
 
 
 def test_limbs_whose_joints_are_not_in_order_are_no_limbs(tmp_path):
-    """Names of a person in another order: no way leads from the ankle inwards to the hip."""
+    """A person's names in another order: the hip is not above the ankle in the hierarchy."""
     text = BVH.replace('base', 'left_ankle').replace('arm', 'left_hip')
     motion = read_motion(write(tmp_path, 'turned.bvh', text))
     assert {'left_ankle', 'left_hip'} <= {*motion.body.joint_names}
@@ -175,7 +175,7 @@ def test_limbs_whose_joints_are_not_in_order_are_no_limbs(tmp_path):
 
 
 def sliding(frames):
-    """A joint with position channels beside the root's."""
+    """A BVH with position channels at a joint other than the root."""
     return (
         BVH.replace(
             'CHANNELS 2 Yrotation Xrotation',
@@ -187,7 +187,7 @@ def sliding(frames):
 
 @pytest.mark.parametrize('second', ['0 2 0', '0 0 0'])
 def test_constant_positions_of_an_inner_joint_are_its_offset(second, tmp_path):
-    """As some programs write them: equal to OFFSET, or nothing beside it."""
+    """Some programs write them equal to OFFSET, others as zero."""
     text = sliding(f'0 0 0 0 0 0 {second} 90\n0 0 0 0 0 0 {second} 0\n')
     motion = read_motion(write(tmp_path, 'inner.bvh', text), unit_to_m=1.0)
     assert motion.body.dimension == 7
@@ -206,7 +206,7 @@ def test_positions_of_an_inner_joint_that_change_are_translations(first, second,
 
 @pytest.mark.parametrize(('written', 'height'), [(0.9, 1.0), (0.0, 1.0), (0.1, 1.1)])
 def test_root_positions_stand_instead_of_an_offset_or_add_to_it(written, height, tmp_path):
-    """Programs differ; numbers that reach the offset itself can only stand instead of it."""
+    """Programs differ; numbers as large as the offset must replace it."""
     text = BVH.replace('OFFSET 1 2 3', 'OFFSET 0 1 0').split('0 0 0 90')[0]
     text = text.replace('Frames: 2', 'Frames: 1') + f'5 {written} 7 0 0 0 0 0\n'
     motion = read_motion(write(tmp_path, 'root.bvh', text), unit_to_m=1.0)
@@ -365,7 +365,7 @@ def test_a_broken_amc_is_refused_with_one_line(case, rod):
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150)
 @given(data=st.data())
 def test_damaged_files_are_read_or_refused(data, rod):
-    """Whatever is cut out, doubled or overwritten, nothing but a MotionFileError escapes."""
+    """For any cut, doubled or overwritten bytes, the only error is MotionFileError."""
     name, text = data.draw(st.sampled_from([('x.bvh', BVH), ('rod.asf', ASF), ('rod.amc', AMC)]))
     start = data.draw(st.integers(0, len(text)))
     stop = data.draw(st.integers(start, min(start + 30, len(text))))
@@ -465,7 +465,7 @@ def test_joints_of_known_rigs_get_standard_names(maker):
 
 
 def person_bvh(unit, up):
-    """A person of about 1.75 m who stands along an axis, in the names of MotionBuilder."""
+    """A BVH of a person of about 1.75 m who stands along an axis, with MotionBuilder's names."""
     axes = [(up + 1) % 3, (up + 2) % 3, up]
 
     def offset(x, y, z):

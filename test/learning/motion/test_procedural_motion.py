@@ -26,7 +26,7 @@ CASES = [
 
 @pytest.fixture(scope='module', params=CASES, ids=lambda case: '-'.join(map(str, case[:2])))
 def motion(request):
-    """Name, body, poses, joints in the world."""
+    """Name, body, poses, and joints in the world frame."""
     name, model, stature, seed = request.param
     body = load_body(model).with_stature(stature)
     poses = procedural_motion(name, body, 4.0, FPS, seed)
@@ -56,7 +56,7 @@ def test_stands_on_the_floor(motion):
     points = forward(body.skeleton, poses).points(mesh.segments, mesh.vertices)
     lowest = VIEW.to_world(points.transpose(2, 0, 1))[..., 2].min(1)
     assert np.abs(lowest).max() < 0.03
-    # One foot at least stays where it is; on the other the toe may be what turns.
+    # At least one foot is at rest; the other may turn about its toe.
     speeds = [
         np.linalg.norm(np.diff(of(body, joints, f'{side}_toe'), axis=0), axis=1) * FPS
         for side in ('left', 'right')
@@ -103,11 +103,11 @@ def test_walks_where_it_is_to_go(heading):
     assert gone @ forwards / np.linalg.norm(gone) > 0.999
     assert 0.8 < np.linalg.norm(gone) / 2.95 < 1.4  # m/s
     assert np.abs(pelvis[[0, -1]].mean(0)).max() < 0.1
-    # The person looks there: the left hip is on the left.
+    # The person faces the walking direction: the left hip is on the left.
     across = (of(body, joints, 'right_hip') - of(body, joints, 'left_hip'))[:, :2]
     assert np.all(across @ ahead(heading - np.pi / 2) > 0.15)
 
-    # Arms and legs of a side swing against each other.
+    # Arm and leg of a side swing in opposite directions.
     def swing(joint, base):
         away = (of(body, joints, joint) - of(body, joints, base))[:, :2] @ forwards
         return away - away.mean()
@@ -165,9 +165,9 @@ def test_viewpoint():
     assert np.allclose(view.rotation @ view.rotation.T, np.eye(3))
     assert np.isclose(np.linalg.det(view.rotation), 1.0)
     assert np.allclose(view.to_camera([0.0, 5.0, 1.5]), 0.0)  # the camera itself
-    # What lies level with the camera is above the middle of the image, as it looks down.
+    # Points at the camera's height are above the middle of the image, as it looks down.
     assert np.isclose(view.to_camera([0.0, 0.0, 1.5])[1], -5.0 * np.sin(0.3))
-    # A person at rest: upright, facing the camera, its left to the right of the image.
+    # A person at rest is upright and faces the camera, with the left side on the image's right.
     body = load_body('human37')
     pose = np.zeros((1, body.dimension))
     pose[0, :3] = Viewpoint().to_camera([0.0, 0.0, 1.0])

@@ -1,4 +1,4 @@
-"""Retargeting: exact where the body can follow, close on recorded people, within limits always."""
+"""Retargeting: exact if the body can follow, close for recorded people, always within limits."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ HUMAN = load_body('human37')
 PAIRED = ('hip', 'knee', 'ankle', 'shoulder', 'elbow', 'wrist')
 MAIN = ('neck', *(f'{side}_{joint}' for side in ('left', 'right') for joint in PAIRED))
 
-# A camera 4 m before the origin, which looks along the world's y axis.
+# A camera 4 m from the origin, which looks along the world's y axis.
 ROTATION = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 CAMERA = (ROTATION, np.array([0.0, 1.0, 4.0]))
 
@@ -41,7 +41,7 @@ def moving(body, frames: int = 40, seed: int = 0, bent: float = 0.6) -> np.ndarr
 
 
 def as_motion(body, poses: np.ndarray, fps: float = 30.0) -> Motion:
-    """Poses of one of our bodies as if recorded: the world is its camera's, y down."""
+    """Poses of a body model as a recorded motion; its world is the camera frame, y down."""
     return Motion('own', body, poses, fps, np.eye(3), 1.0)
 
 
@@ -59,7 +59,7 @@ def test_a_body_follows_its_own_motion(name):
     assert error.max() < 0.006
     assert (result >= body.lower).all()
     assert (result <= body.upper).all()
-    # The angles themselves come back, in the same turn.
+    # The angles themselves are recovered, without whole turns.
     rotations = body.skeleton.dof_is_rotation
     off = (result - poses)[:, rotations]
     off -= 2 * np.pi * np.round(np.median(off, axis=0) / (2 * np.pi))

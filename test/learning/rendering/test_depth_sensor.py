@@ -38,7 +38,7 @@ def test_the_same_seed_gives_the_same_depths():
 
 
 def test_the_depth_of_an_empty_scene():
-    """The floor is where the camera's height says, and things stand before the wall."""
+    """The floor agrees with the camera's height, and furniture stands in front of the wall."""
     camera = Camera(330.0, 330.0, 159.5, 119.5, 320, 240, (-0.2, 0.05, 0.001, 0.0))
     scene = Scene(viewpoint=Viewpoint(distance=3.0, height=1.5, pitch=0.3), seed=1)
     depth = scene.depth(camera)

@@ -45,7 +45,7 @@ def standing(body, **angles):
 
 
 def distance_to(mask):
-    """Of every pixel to the nearest one in the mask, px."""
+    """Distance of every pixel to the nearest one in the mask, px."""
     return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
@@ -62,7 +62,7 @@ def test_mask_ends_at_the_occluding_contour(body, poses, distortion):
         assert np.quantile(gaps, 0.999) <= 1.5
         assert gaps.max() <= 2.0
 
-        # And the other way, but for the tips of the parts, which have no ring.
+        # And vice versa, except for the tips of the parts, which have no ring.
         drawn = np.zeros_like(mask)
         drawn[v, u] = True
         edge = mask & (distance_to(~mask) <= 1.0)
@@ -92,7 +92,7 @@ def test_depth_is_that_of_the_surface(body):
         u, v = np.rint(pixels[seen]).astype(int).T
         z = points[facing][seen, 2]
         own = shown.parts[v, u] == index
-        # What hides it lies in front of it.
+        # Hiding surfaces are in front of it.
         assert np.all(shown.depth[v, u] < z + 0.006)
         error = np.abs(shown.depth[v, u] - z)[own]
         assert np.all(error < 0.006)
@@ -124,7 +124,7 @@ def test_part_in_front_hides_the_other(body):
     assert label('left_knee', 'left_ankle', 0.5) == 'left_shin'
     assert label('pelvis', 'neck', 0.9) == 'trunk'
     assert label('neck', 'head', 1.0) == 'head'
-    # From behind the trunk hides the forearm.
+    # Seen from behind, the trunk hides the forearm.
     pose[body.dof_names.index('root_z')] = np.pi
     joints = body.joint_positions(pose[None])[0]
     shown = render(body, pose, view, BARE)
@@ -166,7 +166,7 @@ def test_shadow_falls_on_the_floor_only(body, poses):
     dark = Scene(viewpoint=VIEW, noise=0.0, shadow=0.9, clutter=2)
     shown, plain = render(body, poses[0], view, dark), render(body, poses[0], view, BARE)
     floor = dark.floor(view)
-    # The scenes differ in the shadows of the things as well: compare with the empty place.
+    # The scenes also differ in shadows of boxes, so each is compared with its empty place.
     empty = dark.add_noise(dark.background(view), 0).astype(int)
     away = distance_to(shown.mask) > 1.5
     change = (shown.image - empty).sum(2)
@@ -177,7 +177,7 @@ def test_shadow_falls_on_the_floor_only(body, poses):
 
 
 def test_clothes_stay_on_the_surface(body):
-    """The same place of the trunk has the same colour after the person has moved."""
+    """A point of the trunk has the same colour after the person has moved."""
     view = camera(1.5)
     scene = Scene(viewpoint=VIEW, noise=0.0, ambient=1.0, clutter=0)
     before = standing(body)

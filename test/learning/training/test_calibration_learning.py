@@ -1,4 +1,4 @@
-"""Calibration on groups left out: what it changes, what it keeps, and its files."""
+"""Calibration on held-out groups: its effects, invariants and files."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ GROUPS, EACH = 12, 40
 
 
 def grouped(seed: int, spread: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Targets that are a line plus an offset that all samples of a group share."""
+    """Targets on a line plus an offset shared by all samples of a group."""
     rng = np.random.default_rng(seed)
     groups = np.repeat(np.arange(GROUPS), EACH)
     places = np.linspace(-3.0, 3.0, GROUPS)[rng.permutation(GROUPS)]
@@ -28,7 +28,7 @@ def grouped(seed: int, spread: float) -> tuple[np.ndarray, np.ndarray, np.ndarra
 def test_what_motions_left_out_add() -> None:
     inputs, targets, groups = grouped(0, 0.5)
     model = LearningCalibration(NearestNeighbours(3))
-    # Neighbours of the same group know its offset: the plain model is far too sure.
+    # Neighbours of the same group reveal its offset, so the plain model is overconfident.
     plain = NearestNeighbours(3).fit(inputs, targets)
     assert np.sqrt(np.trace(plain.noise_)) < 0.25
     model.fit(inputs, targets, groups=groups)

@@ -1,4 +1,4 @@
-"""The spread of lengths over people against people drawn from a known one."""
+"""The spread of lengths over people, learned from people drawn from a known one."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_many_people_tell_their_spread(body):
 
 
 def test_the_spread_is_the_most_probable_one(body):
-    """No spread near the one that is found has a larger posterior density."""
+    """No spread near the result has a larger posterior density."""
     usual, people, weight = usual_spread(body), drawn(usual_spread(body), 6, 3), 4.0
     found = learned_spread(people, usual, weight)
     x = people - people.mean(0)
@@ -66,7 +66,7 @@ def test_densities_are_those_of_scipy(body):
 
 
 def test_a_skeleton_that_people_share_is_of_none(body):
-    """One who has another besides counts by that, twice recorded once."""
+    """People who have another skeleton, too, count by that; repeated recordings count once."""
     shared = body.skeleton.lengths
     own, other = shared * 1.1, shared * np.linspace(0.9, 1.1, 12)
     people = ['a', 'b', 'b', 'b', 'c', 'c']

@@ -17,7 +17,7 @@ FLIP = np.array([-1.0, 1.0, 1.0])  # the mirror image changes the sign of the fi
 
 
 def samples(count: int = 400, seed: int = 0) -> MirroredSamples:
-    """Two clusters of 3:1, each seen either way round."""
+    """Two clusters with a ratio of 3:1, each in both mirror images."""
     rng = np.random.default_rng(seed)
     first = rng.random(count) < 0.75
     means = np.where(first[:, None], [2.0, 0.0, 0.0], [0.5, 4.0, -1.0])
@@ -45,7 +45,7 @@ def test_clusters_are_found_once_for_both_sides():
     assert np.allclose(weights, [0.95 * 0.75, 0.95 * 0.25], atol=0.05)
     deviations = np.sqrt(np.diagonal(found.covariances[1:][order], axis1=1, axis2=2))
     assert np.allclose(deviations, [[0.3] * 3, [0.5] * 3], atol=0.1)
-    # The broad component stays what it is.
+    # The broad component is unchanged.
     assert found.weights[0] == 0.05
     assert np.array_equal(found.covariances[0], 9.0 * np.eye(3))
 

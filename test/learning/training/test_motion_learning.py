@@ -1,4 +1,4 @@
-"""The learning of motion against motions of known dynamics."""
+"""Learning of dynamics from motions with known dynamics."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_the_dynamics_of_simulated_motions_are_found(human32, truth):
     learned = learned_motion(human32, motions, RATE, 'simulated')
     assert learned.card == 'simulated'
     d = human32.dimension
-    # Displacements are cut at their largest, which costs some of the variance.
+    # Displacements are limited, which loses some of the variance.
     ratio = np.diagonal(learned.dynamics.unknown_velocity) / np.diagonal(truth.unknown_velocity)
     assert np.abs(np.log(ratio)).max() < 0.25
     assert np.abs(np.log(learned.damping / truth.damping)).max() < 0.4
@@ -73,7 +73,7 @@ def test_a_turn_of_the_heading_changes_nothing(human32, truth):
     turned[:, human32.skeleton.dof_index(('root_z',))] += 1.0
     turned[:, :3] += [1.0, 0.2, -3.0]
     a, b = (learned_motion(human32, [x], RATE) for x in (motion, turned))
-    # As far as the optimiser goes.
+    # Within the optimiser's tolerance.
     np.testing.assert_allclose(a.diffusion, b.diffusion, rtol=1e-3, atol=1e-9)
 
 

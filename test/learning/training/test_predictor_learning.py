@@ -50,7 +50,7 @@ def test_the_metric_of_targets_is_that_of_joints():
 
 
 def degenerate_pairs():
-    """Inputs, targets and motions that hold less than their number suggests."""
+    """Inputs, targets and motions with less information than their number suggests."""
     rng = np.random.default_rng(0)
     inputs = rng.normal(size=(200, 8))
     targets = np.tanh(inputs @ rng.normal(size=(8, 5)))
@@ -71,7 +71,7 @@ def degenerate_pairs():
 @pytest.mark.parametrize('case', degenerate_pairs())
 @pytest.mark.parametrize('name', [x for x in KINDS if x != 'network'])
 def test_degenerate_pairs_are_learned(name, case):
-    """Mixtures are finite and wide enough to be any, and far away nothing supports them."""
+    """Mixtures are finite and wide enough to be valid, and have no support far away."""
     inputs, targets, motions = degenerate_pairs()[case]
     model = new_model(name, samples=len(inputs)).fit(inputs, targets, groups=motions)
     far = inputs[:1] + 100.0

@@ -90,7 +90,7 @@ def test_a_motion_seen_from_a_heading(body, sequences, heading, wanted):
     front = root_rotations(body, poses)[:, :, 1].mean(0)
     across, _, away = front
     np.testing.assert_allclose(np.array([across, away]) / np.hypot(across, away), wanted, atol=1e-9)
-    # The posture is that of the motion.
+    # The posture is the same as in the motion.
     np.testing.assert_array_equal(poses[:, 6:], sequences[1].poses[10:30:2, 6:])
 
 

@@ -1,4 +1,4 @@
-"""Reading bags: every form that recorders write, and every defect as one line."""
+"""Reading bags: all forms that recorders write, and one error line for every defect."""
 
 import csv
 import json
@@ -95,7 +95,7 @@ def test_reads_what_the_writer_wrote(small_bag):
 )
 def test_any_mcap_comes_in_the_order_of_time(tmp_path, messages, options, compression):
     rng = np.random.default_rng(5)
-    # Many equal times, and far out of order, so that many chunks overlap.
+    # Many equal and unordered times, so that many chunks overlap.
     times = (np.arange(400) // 2 + rng.integers(-30, 30, 400)).clip(0).tolist()
     path = tmp_path / 'any.mcap'
     entries = [(time, text(messages, f'{i} ' + 'x' * 50)) for i, time in enumerate(times)]
@@ -113,7 +113,7 @@ def test_split_bag_is_merged_by_time(tmp_path, messages):
     for part, times in enumerate([range(0, 100, 3), range(50, 150, 5), range(120, 200, 7)]):
         entries = [(time, text(messages, f'{part}.{time}')) for time in times]
         write_mcap(folder / f'split_{part}.mcap', entries, chunk_size=200)
-    # Early versions wrote the folder into the names.
+    # Early versions included the folder in the names.
     write_metadata(folder, ['split/split_0.mcap', 'split_1.mcap', 'split_2.mcap'])
     found = values(folder)
     assert len(found) == 34 + 20 + 12
@@ -193,14 +193,14 @@ def test_a_known_type_in_another_version_is_read_by_its_own_definition(tmp_path)
             if msgtype == STRING:
                 assert stored.message.only_this == 'ab'
                 continue
-            # Of those of the project every field is read.
+            # All fields of the project's own types must be known.
             with pytest.raises(BagError, match='recorded with another definition of this type'):
                 _ = stored.message
 
 
 @pytest.mark.parametrize('nested', [False, True])
 def test_messages_of_the_project_from_before_a_field(tmp_path, messages, nested):
-    """What their definition lacks is zero or empty, also where only a type within is older."""
+    """Fields missing in the definition are zero or empty, also in older nested types."""
     kind = 'hmt_msgs/msg/PoseMixture'
     component = messages.create('hmt_msgs/msg/PoseComponent', id=3, mean=np.arange(4.0))
     header = header_message(messages, 5, 'lens')
@@ -396,13 +396,13 @@ def test_flipped_bits_never_change_a_message(tmp_path, small_bag, read):
     for seed in range(150):
         rng = np.random.default_rng(seed)
         damaged = bytearray(content)
-        # Headers and the summary are small: half of the hits go there.
+        # Headers and the summary are small, so half of the damage is placed there.
         span = len(content) if seed % 2 else 2500
         for offset in rng.integers(0, span, 1 + seed % 3):
             damaged[-1 - offset] ^= 1 << rng.integers(8)
         path.write_bytes(damaged)
         found, error = read(path)
-        # The summary, whose checksum is not compared, may have another name of a topic.
+        # The summary has no checked checksum, so a topic's name may change there.
         assert error is not None or len(found) == len(whole)
         assert {(time, data) for time, _, data in found} <= messages
 
@@ -444,7 +444,7 @@ def test_lengths_are_not_believed(tmp_path, messages, read, field, value):
     found, _ = read(path)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    # The libraries do not use all of them.
+    # The libraries do not read all of the file.
     assert len(found) <= 1
     assert peak < 5e6
 
@@ -454,8 +454,8 @@ def test_a_cut_is_told_in_one_line(tmp_path, small_bag, caplog):
     path.write_bytes((small_bag / 'small.mcap').read_bytes()[:1000])
     with BagReader(path) as bag:
         assert caplog.messages == [
-            f'{path} breaks off: it is read up to its last complete message; `mcap recover` makes '
-            'a whole file of it, and `ros2 bag reindex` the metadata of its folder'
+            f'{path} breaks off: it is read up to its last complete message; `mcap recover` '
+            'repairs the file, and `ros2 bag reindex` the metadata of its folder'
         ]
         with pytest.raises(BagError, match=r'has no topic of type String; it has none'):
             bag.find_topic([STRING])

@@ -1,4 +1,4 @@
-"""Writing bags: what other tools read, the same bytes every time, whole or not at all."""
+"""Writing bags: readable by other tools, reproducible, and complete or not at all."""
 
 from collections import Counter
 from pathlib import Path
@@ -47,7 +47,7 @@ def test_same_calls_write_the_same_bytes(tmp_path, messages):
 
 
 def test_topics_have_absolute_names(tmp_path, messages):
-    """rosbag2 makes the names that a user gives absolute, and compares them with these."""
+    """rosbag2 makes names given by a user absolute, and compares them with these."""
     text = messages.create(STRING, data='')
     with BagWriter(tmp_path / 'bag', namespace='/humans/bodies/p1') as bag:
         bag.add_topic('body', STRING, latched=True)
@@ -107,7 +107,7 @@ def test_rosbags_reads_it(tmp_path, messages):
         assert [time for _, time, _ in reader.messages([by_topic['/text']])] == [
             10**18 + i * 33_333_333 for i in range(20)
         ]
-    # With the definitions of the bag alone.
+    # With only the definitions in the bag.
     with AnyReader([tmp_path / 'bag']) as reader:
         connections = [
             connection for connection in reader.connections if connection.topic == '/body'

@@ -1,4 +1,4 @@
-"""Well-formed bags that claim more than they have: one line, before memory is spent."""
+"""Well-formed bags with excessive claims: one error line, without much memory."""
 
 import os
 import sqlite3
@@ -52,7 +52,7 @@ def chunk(content, compression='zstd', size=None, packed=None):
 
 
 def with_summary(data, chunks, count):
-    """A file whose summary lists chunks, each by its offset and length."""
+    """A file whose summary lists chunks by offset and length."""
     summary = RecordBuilder()
     for offset, length in chunks:
         ChunkIndex(length, offset, 'zstd', 0, 0, 0, {}, 0, 0).write(summary)
@@ -64,7 +64,7 @@ def with_summary(data, chunks, count):
 
 
 def error_of(path, *, peak=2**25):
-    """The line with which a bag is refused, after at most so much memory."""
+    """The error line for a bag, refused with at most `peak` bytes of memory."""
     line = ''
     tracemalloc.start()
     try:
@@ -189,7 +189,7 @@ def test_a_bag_of_very_many_topics(tmp_path, monkeypatch):
         with pytest.raises(BagError) as caught:
             bag.find_topic(['sensor_msgs/msg/Image'])
         assert len(str(caught.value)) < 600
-        # Not compared with each other.
+        # The two are not compared with each other.
         assert len(list(bag.messages(list(bag.topics)))) == 1
 
 
@@ -216,7 +216,7 @@ def test_a_compressed_file_is_unpacked_within_its_budget(tmp_path, monkeypatch):
     path.write_bytes(zstandard.compress(MAGIC + ZEROS * 20))
     assert 'is refused: it unpacks to more than' in error_of(path, peak=2**23)
     assert list(scratch.iterdir()) == []
-    # Frames that follow each other, and one that is skipped.
+    # Consecutive frames, and a skippable one.
     content = MAGIC + HEADER + described() + message(string('x')) + END
     skipped = struct.pack('<II', 0x184D2A50, 4) + b'note'
     path.write_bytes(zstandard.compress(content[:60]) + skipped + zstandard.compress(content[60:]))
@@ -298,7 +298,7 @@ TOPICS = (
 )
 MESSAGES = 'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data)'
 NUMBERS = 'WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n LIMIT {})'
-# Each names the one before twice: their number of columns is known after 2**40 steps.
+# Each view uses the previous one twice, so counting their columns takes 2**40 steps.
 NESTED_VIEWS = (
     'CREATE VIEW v0 AS SELECT 1 AS x',
     *(f'CREATE VIEW v{i + 1} AS SELECT a.x FROM v{i} a, v{i} b' for i in range(40)),

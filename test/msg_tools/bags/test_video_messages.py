@@ -1,4 +1,4 @@
-"""Videos in bags become images, with PyAV or with a stand-in that keeps its contract."""
+"""Videos in bags become images, with PyAV or with a compatible stand-in."""
 
 import sys
 from fractions import Fraction
@@ -25,7 +25,7 @@ string format
 
 
 def scene(number):
-    """Its grey level tells the number."""
+    """An image whose grey level encodes the number."""
     return np.full((48, 64, 3), 30 + 16 * number, np.uint8)
 
 
@@ -34,9 +34,9 @@ def number_in(picture):
 
 
 class Decoder:
-    """Of packets b'K<number>' (key frame), b'P<number>', b'H' (parameters only), b'!' (damaged).
+    """Decodes packets b'K<number>' (key frame), b'P<number>', b'H' (parameters), b'!' (damaged).
 
-    It gives pictures one packet late.
+    Pictures are returned one packet late.
     """
 
     def __init__(self):
@@ -88,7 +88,7 @@ def write(path, packets, kind='h264'):
 
 
 def pictures(path):
-    """(index of the message, number in the picture) of the images."""
+    """(message index, number in the picture) of the images."""
     with BagReader(path) as bag:
         assert is_video(bag, bag.topics[TOPIC])
         found = []
@@ -105,13 +105,13 @@ def pictures(path):
 @pytest.mark.usefixtures('stand_in')
 def test_pictures_have_the_stamps_of_their_packets(tmp_path):
     packets = [b'P9', b'P9', b'H', b'K1', b'P2', b'!', b'P3', b'P4']
-    # What comes before the key frame, and what is damaged, is left out.
+    # Packets before the key frame and damaged ones are skipped.
     assert pictures(write(tmp_path / 'bag', packets)) == [(3, 1), (4, 2), (6, 3), (7, 4)]
 
 
 @pytest.mark.usefixtures('stand_in')
 def test_without_a_key_frame_there_is_no_picture(tmp_path):
-    with pytest.raises(BagError, match='none of its 2 packets of video is a whole key frame'):
+    with pytest.raises(BagError, match='none of its 2 packets of video is a complete key frame'):
         pictures(write(tmp_path / 'bag', [b'P1', b'P2']))
 
 

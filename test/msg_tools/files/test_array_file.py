@@ -100,7 +100,7 @@ def test_hostile_heads_are_one_line(name, tmp_path):
 
 
 def test_what_unfolds_is_in_proportion_to_the_file(tmp_path):
-    """An archive of zeros, many names for one array, and bytes that become larger numbers."""
+    """With an archive of zeros, many names for one array, and bytes that become larger numbers."""
     path = tmp_path / 'bomb.npz'
     np.savez_compressed(path, zeros=np.zeros(20_000_000))
     with pytest.raises(ValueError, match='it unpacks to more than'):

@@ -1,4 +1,4 @@
-"""Files up to an agreed size."""
+"""Files up to a given size."""
 
 import os
 
@@ -17,7 +17,7 @@ def test_content_up_to_the_limit(tmp_path):
 
 
 def test_pipes_and_devices_are_refused_at_once(tmp_path):
-    os.mkfifo(tmp_path / 'pipe')  # nobody writes into it: opened as usual, it would wait for ever
+    os.mkfifo(tmp_path / 'pipe')  # nobody writes into it: an ordinary open would block for ever
     for path in (tmp_path / 'pipe', '/dev/zero', '/dev/null'):
         with pytest.raises(ValueError, match='a pipe or a device, wanted a file'):
             read_bytes(path, 1000)

@@ -95,7 +95,7 @@ def test_remains_of_a_killed_process_are_named_and_removed_on_success(tmp_path, 
     caplog.clear()
     write(tmp_path / 'out', kind)
     assert [x.name for x in tmp_path.iterdir()] == ['out']
-    assert caplog.messages == [f'{left}: removed, a run that was killed had left it']
+    assert caplog.messages == [f'{left}: removed; a run that was killed had left it']
 
 
 @pytest.mark.parametrize('kind', ['folder', 'file'])

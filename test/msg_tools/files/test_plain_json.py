@@ -1,4 +1,4 @@
-"""JSON from outside: its memory is bounded before it is read."""
+"""JSON from outside: the memory it needs is bounded before it is parsed."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""YAML from outside: data alone, bounded."""
+"""YAML from outside is read as plain data of bounded size."""
 
 import random
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Videos from outside: their own images alone, and no more of them than their bytes."""
+"""Videos from outside: only their own images, and no more images than bytes."""
 
 import struct
 
@@ -61,7 +61,7 @@ def test_no_other_file_is_read(name, text, tmp_path):
 
 
 def test_more_images_than_bytes_are_not_announced(tmp_path):
-    """FFmpeg makes 24 bytes of each that a table or a fragment announces in four."""
+    """FFmpeg needs 24 bytes for each image that a table or fragment announces in four bytes."""
     whole = write_video(tmp_path / 'a.mp4').read_bytes()
     at = whole.index(b'stsz') + 8
     path = tmp_path / 'many.mp4'

@@ -1,4 +1,4 @@
-"""CameraInfo to a camera: what real drivers send, and what gives no camera."""
+"""CameraInfo to a camera: messages of real drivers, and invalid ones."""
 
 import re
 from types import SimpleNamespace
@@ -74,7 +74,7 @@ def test_a_distortion_that_folds_in_the_corners_is_told():
     camera_from_info(info(d=np.array([-0.34, 0.0, 0.0, 0.0, 0.0])), tell=told.append)
     (line,) = told
     # It folds at 2 / 3 of the ideal radius, where 1 - 1.02 r^2 is 0; a corner lies at 0.677.
-    assert re.search('the image from 9[678]% of the way to a corner on', line)
+    assert re.search('beyond 9[678]% of the way to a corner', line)
 
 
 def test_region_and_binning():

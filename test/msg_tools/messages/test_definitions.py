@@ -1,4 +1,4 @@
-"""Definitions: the fields that rosbags finds too, and limits before code is generated."""
+"""Definitions: the same fields as in rosbags, and limits before code is generated."""
 
 import numpy as np
 import pytest
@@ -97,7 +97,7 @@ def test_a_known_type_keeps_our_definition_where_that_of_a_bag_can_not_be_parsed
 
 
 def count(value):
-    """Values of a message, or of a field of one; an array of numbers is one."""
+    """Number of values in a message or field; an array of numbers is one value."""
     if isinstance(value, list):
         return 1 + sum(map(count, value))
     name = getattr(value, '__msgtype__', None)

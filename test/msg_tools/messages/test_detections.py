@@ -1,4 +1,4 @@
-"""People in the messages of other detectors, and what is refused."""
+"""People in messages of other detectors, and refused messages."""
 
 from types import SimpleNamespace
 
@@ -46,7 +46,7 @@ def test_skeletons_that_are_none():
 
 
 def detection(name, **points):
-    """A detection of yolo_ros: its keypoints have numbers from 1."""
+    """A detection of yolo_ros, whose keypoints are numbered from 1."""
     data = [
         SimpleNamespace(
             id=COCO.names.index(key) + 1 if key in COCO.names else int(key[1:]),

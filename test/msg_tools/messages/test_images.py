@@ -1,4 +1,4 @@
-"""Pictures in messages: every encoding against OpenCV, every defect as one line."""
+"""Images in messages: every encoding compared with OpenCV, one error line for every defect."""
 
 import struct
 import zlib
@@ -24,14 +24,14 @@ RNG = np.random.default_rng(2)
 
 
 def scene():
-    """A smooth picture with colours, BGR."""
+    """A smooth coloured image, BGR."""
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH]
     planes = [128 + 100 * np.sin(u / 7), 128 + 100 * np.cos(v / 9), 255 * u / WIDTH]
     return np.stack(planes, axis=-1).round().astype(np.uint8)
 
 
 def raw(pixels, encoding, /, *, padding=0, big=False, **changes):
-    """An Image of rows of pixels."""
+    """An Image message of rows of pixels."""
     kind = pixels.dtype.newbyteorder('>' if big else '<')
     rows = np.ascontiguousarray(pixels.astype(kind)).view(np.uint8).reshape(len(pixels), -1)
     padded = np.hstack([rows, np.full((len(rows), padding), 171, dtype=np.uint8)])
@@ -59,7 +59,7 @@ def eight_bits(words):
     return np.rint(words.astype(np.float64) / 257.0).astype(np.uint8)
 
 
-# Encoding, pixels as sent, picture wanted.
+# Encoding, pixels as sent, expected image.
 CASES: list[tuple[str, Any, Any]] = [
     ('mono8', GREY, cv2.cvtColor(GREY, cv2.COLOR_GRAY2BGR)),
     ('8UC1', GREY, cv2.cvtColor(GREY, cv2.COLOR_GRAY2BGR)),
@@ -107,7 +107,7 @@ def test_every_encoding(encoding, pixels, wanted, padding):
 @pytest.mark.parametrize('padding', [0, 2, 6])
 @pytest.mark.parametrize('encoding', ['yuv420', 'i420', 'yv12'])
 def test_three_planes(encoding, padding):
-    """Rows of chroma are half as long, with half the padding, as libcamera writes them."""
+    """Chroma rows have half the length and half the padding, as in libcamera."""
     wanted = cv2.cvtColor(PLANES, cv2.COLOR_YUV2BGR_I420)
     luma, chroma = PLANES[:HEIGHT], PLANES[HEIGHT:].reshape(2, HEIGHT // 2, WIDTH // 2)
     halves = chroma[::-1] if encoding == 'yv12' else chroma
@@ -203,7 +203,7 @@ def test_jpeg_that_was_cut_anywhere_is_no_picture():
     for length in range(len(data) - 1):
         with pytest.raises(ImageError):
             decode_image(compressed(data[:length]))
-    # Cameras pad their pictures.
+    # Cameras pad their images.
     assert decode_image(compressed(data + bytes(7))).shape == BGR.shape
 
 
@@ -275,7 +275,7 @@ def chunk(kind, content):
 
 @pytest.mark.parametrize('place', [33, -12])
 def test_chunks_of_a_png_that_its_picture_does_not_need_are_never_unpacked(place):
-    """Texts and profiles of 8 MB each, which the decoder would keep, and frames of an animation."""
+    """Texts and profiles of 8 MB each, which the decoder would store, and animation frames."""
     png = encoded('.png', BGR)
     text = chunk(b'zTXt', b'a\0\0' + zlib.compress(bytes(7_900_000), 9)) * 20
     profile = chunk(b'iCCP', b'a\0\0' + zlib.compress(bytes(7_900_000), 9))
@@ -289,7 +289,7 @@ def test_chunks_of_a_png_that_its_picture_does_not_need_are_never_unpacked(place
 
 
 def test_many_scans_of_a_large_jpeg_are_refused():
-    """Each costs a pass over all pixels: 67 of these are as many as a hundred of small ones."""
+    """Each scan costs a pass over all pixels: 67 of them cost too much in a large image."""
     done, file = cv2.imencode(
         '.jpg', np.zeros((4000, 4000), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
     )

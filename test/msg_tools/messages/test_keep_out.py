@@ -1,4 +1,4 @@
-"""hmt_msgs/KeepOut, and what planners and viewers get of it."""
+"""hmt_msgs/KeepOut and the messages for planners and viewers made from it."""
 
 import numpy as np
 import pytest
@@ -78,7 +78,7 @@ def test_bad_messages_are_refused():
 
 
 def axis(orientation):
-    """The direction that a quaternion turns z to."""
+    """The z axis rotated by a quaternion."""
     x, y, z, w = (getattr(orientation, name) for name in 'xyzw')
     assert np.isclose(np.linalg.norm([x, y, z, w]), 1.0)
     return np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])

@@ -1,4 +1,4 @@
-"""Keypoints2D and Keypoints3D to arrays and back, and what is refused."""
+"""Keypoints2D and Keypoints3D to arrays and back, and refused messages."""
 
 from dataclasses import replace
 from typing import Any
@@ -61,7 +61,7 @@ def test_covariances_of_some_may_be_unknown(messages):
     np.testing.assert_array_equal(content.covariances[2], [[4, 1], [1, 9]])
     again = keypoints_of(keypoints_message(messages, content, 7, 'camera'))
     np.testing.assert_array_equal(again.covariances, content.covariances)
-    # Where nothing is known of any, the message has none.
+    # If all covariances are unknown, the message has none.
     nothing = replace(content, covariances=np.full((3, 2, 2), np.nan))
     assert len(keypoints_message(messages, nothing, 7, 'camera').covariance) == 0
     assumed = keypoints_of(given, 3.0)
@@ -131,7 +131,7 @@ def test_positions_join_keypoints_by_name(messages):
 
 
 def test_a_message_of_nobody(messages):
-    """What a detector writes that saw nobody is read: no keypoints, no positions."""
+    """The message of a detector that saw nobody is read: no keypoints, no positions."""
     written = keypoints_message(messages, NO_KEYPOINTS, 7, 'camera')
     found = keypoints_of(written, 3.0)
     assert (found.names, found.pixels.shape, found.covariances.shape) == ((), (0, 2), (0, 2, 2))

@@ -1,4 +1,4 @@
-"""The pose of a person, with its covariance about fixed axes."""
+"""The pose of a person and its covariance about fixed axes."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_axes_are_forward_left_and_up(body):
 
 
 def test_covariance_is_that_of_samples(body):
-    """Of the rotation, about the axes of the camera, and of what it has to do with the place."""
+    """The covariance of the rotation about the camera's axes, and that with the position."""
     rng = np.random.default_rng(0)
     poses = one(body, root_z=1.2, root_y=0.5, root_x=0.4)
     root = rng.normal(size=(37, 37)) * 0.01

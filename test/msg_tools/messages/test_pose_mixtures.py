@@ -1,4 +1,4 @@
-"""PoseMixture to arrays and back, and what is refused."""
+"""PoseMixture to arrays and back, and refused messages."""
 
 import math
 from dataclasses import replace
@@ -46,7 +46,7 @@ def test_round_trip_sorts_by_weight(pose_mixture, messages):
         'body_model', 'dof_names', 'joint_names', 'kind', 'stamp_ns', 'frame_id', 'segment_lengths',
     ):  # fmt: skip
         assert getattr(back, name) == getattr(pose_mixture, name)
-    # Sorted it is the same message again.
+    # After sorting, it is the same message again.
     assert serialise(pose_mixture_message(messages, back)) == data
 
 
@@ -80,7 +80,7 @@ def test_nobody(messages):
 
 
 def test_error_model(pose_mixture, messages):
-    """Both are unknown where a publisher leaves them alone."""
+    """Both values are unknown if a publisher does not set them."""
     told = replace(pose_mixture, error_share=0.5, error_time=0.0)
     back = pose_mixture_of(pose_mixture_message(messages, told))
     assert (back.error_share, back.error_time) == (0.5, 0.0)
@@ -99,9 +99,9 @@ def test_error_model(pose_mixture, messages):
 
 
 def test_relative_covariances_are_those_of_samples():
-    """Of joints as seen from the pelvis, whose own place is the least certain.
+    """Covariances of joints relative to the pelvis, whose position is the least certain.
 
-    Joints of people lie elsewhere than the body's, too, whatever the pose.
+    They include pose-independent errors of the joints.
     """
     body = load_body('human37')
     sigma = np.where(body.skeleton.dof_is_rotation, 1e-3, 0.3)
@@ -121,7 +121,7 @@ def test_relative_covariances_are_those_of_samples():
 
 
 def test_messages_measure_root_angles_against_the_camera():
-    """Whatever the level of the body: readers know no other."""
+    """For any level of the body, because readers know no other reference."""
     body = load_body('human37')
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     level, pose = body.levelled(turn @ turn), body.prior_mean.copy()
@@ -138,13 +138,13 @@ def test_messages_measure_root_angles_against_the_camera():
     wanted = content.joint_covariances[0] - np.square(body.joint_errors)[:, None, None] * np.eye(3)
     for found in (content.covariances[0], content.shape_covariance):
         assert slopes @ found @ slopes.transpose(0, 2, 1) == pytest.approx(wanted, abs=1e-9)
-    # At the level of the camera the numbers stay what they are.
+    # At the level of the camera the numbers do not change.
     same = PoseMixture.of_body(body, mixture, MixtureKind.POSTERIOR, 10**18, 'lens')
     assert np.array_equal(same.means, mixture.means)
 
 
 def test_probability_of_existence(pose_mixture, messages):
-    """NaN where it is unknown, as of publishers that leave the field alone."""
+    """NaN if unknown, also for publishers that do not set the field."""
     content = replace(pose_mixture, state=TrackState.LOST, existence_probability=0.25)
     message = pose_mixture_message(messages, content)
     assert pose_mixture_of(message).existence_probability == 0.25
@@ -162,7 +162,7 @@ def test_probability_of_existence(pose_mixture, messages):
 
 
 def test_probabilities_of_cues(pose_mixture, messages):
-    """By name, in their order; empty where they are unknown."""
+    """By name, in their order; empty if unknown."""
     told = {'silhouette': 0.25, 'keypoints/legs': 0.0, 'track': 1.0}
     message = pose_mixture_message(messages, replace(pose_mixture, cue_probabilities=told))
     back = pose_mixture_of(deserialise(serialise(message), POSE_MIXTURE))
@@ -184,7 +184,7 @@ CHAIN = {
 
 
 def test_weights_and_ancestry_of_the_chain_of_the_modes(pose_mixture, messages):
-    """Columns stay in the order of their ids; rows come with their components."""
+    """Columns keep the order of their ids; rows follow their components."""
     message = pose_mixture_message(messages, replace(pose_mixture, **CHAIN))
     back = pose_mixture_of(deserialise(serialise(message), POSE_MIXTURE))
     assert back.identities.tolist() == pose_mixture.identities[::-1].tolist()
@@ -193,14 +193,14 @@ def test_weights_and_ancestry_of_the_chain_of_the_modes(pose_mixture, messages):
     assert back.ancestry_ids.tolist() == CHAIN['ancestry_ids'].tolist()
     assert back.ancestry_stamp_ns == CHAIN['ancestry_stamp_ns']
     assert serialise(pose_mixture_message(messages, back)) == serialise(message)
-    # Weights without ancestry: the modes begin.
+    # Weights without ancestry belong to first modes.
     weights = CHAIN['posterior_weights']
     for ancestry in (None, np.empty((3, 0))):
         begins = replace(pose_mixture, posterior_weights=weights, ancestry=ancestry)
         back = pose_mixture_of(pose_mixture_message(messages, begins))
         assert back.posterior_weights.tolist() == weights[::-1].tolist()
         assert (back.ancestry.shape, back.ancestry_ids.shape) == ((3, 0), (0,))
-    # A publisher that leaves all of them alone, or says that it does not know.
+    # A publisher that sets none of them, or marks them as unknown.
     message = pose_mixture_message(messages, pose_mixture)
     for nothing in (0.0, math.nan):
         for component in message.components:

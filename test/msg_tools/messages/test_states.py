@@ -52,7 +52,7 @@ TRAJECTORIES = TrajectoryMixture(
 
 
 def check_trajectory(messages):
-    """The heaviest trajectory, and the one of an identity."""
+    """Checks the heaviest trajectory and that of an identity."""
     message = joint_trajectory(messages, TRAJECTORIES)
     assert list(message.joint_names) == ['shoulder', 'elbow']
     assert (time_ns(message.header.stamp), message.header.frame_id) == (STAMPS[0], 'camera')

@@ -1,4 +1,4 @@
-"""TrajectoryMixture to arrays and back, and what is refused."""
+"""TrajectoryMixture to arrays and back; invalid messages are refused."""
 
 from dataclasses import replace
 

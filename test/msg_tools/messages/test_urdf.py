@@ -1,4 +1,4 @@
-"""The URDF of a body against Pinocchio."""
+"""The URDF of a body, compared with Pinocchio."""
 
 import xml.etree.ElementTree as ET
 from typing import Any

@@ -1,4 +1,4 @@
-"""Which limbs an image is searched for."""
+"""The limbs that are searched for in an image."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SHAPE = {'edges': object()}
 
 
 def searched_for(observation, *, surprising=False, settings=None):
-    """Limbs that an image is searched for."""
+    """The limbs that are searched for in an image."""
     posterior = Posterior(BODY, CAMERA, settings or TrackerSettings())
     return set(limbs_not_shown(posterior, observation, surprising))
 
@@ -59,7 +59,7 @@ def test_keypoints_that_are_not_believed_show_nothing():
     every = Observation(keypoints=seen(*BODY.joint_names), evidence=SHAPE)
     observation = replace(every, beliefs=Beliefs(1.0, np.array([1.0, 0.1, 0.9]), 1.0))
     assert searched_for(observation) == {'left_arm', 'right_arm'}
-    # Nor are they where an image is surprising.
+    # Neither do the keypoints of a surprising image.
     assert searched_for(every, surprising=True) == LIMBS
     usual = TrackerSettings()
     off = replace(usual.likelihood, keypoints=TermSettings(0.0, 1.0, 3.0))

@@ -41,7 +41,7 @@ def test_without_an_image_a_limb_goes_where_the_prior_wants_it_given_the_other_l
     value, gradient, hessian = Sum((prior, kept)).energy(found, np.arange(2))
     start = Sum((prior, kept)).energy(pose[None, own], np.arange(1)).value
     assert value.min() <= start[0]
-    # The next Newton step would gain less than the tolerance of the search.
+    # A further Newton step would gain less than the tolerance of the search.
     for x, g, h in zip(found, gradient, hessian, strict=True):
         free = (x > body.lower[own] + 1e-6) & (x < body.upper[own] - 1e-6)
         gain = 0.5 * g[free] @ np.linalg.solve(h[np.ix_(free, free)], g[free])

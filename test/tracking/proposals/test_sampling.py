@@ -52,7 +52,7 @@ def test_spherical_samples_have_the_volume_of_the_covariance(free, modes, scale)
 
 
 def test_cauchy_tails_of_covariance_scaled_samples(free, modes):
-    """Along any direction a standard Cauchy; the Mahalanobis distance squared is d F(d, 1)."""
+    """Standard Cauchy along any direction; the squared Mahalanobis distance is d F(d, 1)."""
     means, covariances = modes
     samples = covariance_scaled_samples(free, *modes, N, 0.0, np.random.default_rng(3))
     d = free.dimension
@@ -61,7 +61,7 @@ def test_cauchy_tails_of_covariance_scaled_samples(free, modes):
         for line in (white[0], white[-1], white[:4].sum(0) / 2):
             assert stats.kstest(line, stats.cauchy.cdf).statistic < 1.95 / np.sqrt(N)
         square = (white**2).sum(0) / d
-        # The tail is cut where noise is divided by 1e-3 or less: once in 1250.
+        # The tail is cut where noise is divided by 1e-3 or less, which is once in 1250.
         assert stats.kstest(square, stats.f(d, 1).cdf).statistic < 1.95 / np.sqrt(N) + 1e-3
 
 

@@ -1,4 +1,4 @@
-"""The pose by keypoints, which leads limbs out of a silhouette that they have left."""
+"""The pose from keypoints, which helps when limbs have left the silhouette of the last image."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from hmt_learning.rendering.scene import Scene
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings
 
-# Images of a person who stands, and intervals, ns.
+# Number of images of a standing person, and intervals, ns.
 STILL, INTERVAL, GAP = 4, 33_000_000, 400_000_000
 RAISED = {'left_shoulder_x': 2.4, 'right_shoulder_x': 2.2, 'left_hip_x': 1.2, 'left_knee': 0.3}
 
 
 @pytest.fixture(scope='module')
 def kicked(human32, camera, motion):
-    """Poses of a person who stands, and in the last image holds arms and a leg up; the images."""
+    """Poses and images of a person who stands, and raises arms and a leg in the last image."""
     poses = np.repeat(motion[:1], STILL + 1, axis=0)
     rows = [human32.dof_names.index(name) for name in RAISED]
     poses[:, rows] = 0.1

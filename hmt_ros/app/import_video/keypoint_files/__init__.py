@@ -1,1 +1,1 @@
-"""Files of 2D detectors: a module per family of formats, check of a clip, choice of a person."""
+"""Keypoint files of 2D detectors: their formats, the check of a clip, the choice of a person."""

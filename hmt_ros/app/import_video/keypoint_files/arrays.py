@@ -11,14 +11,14 @@ from msg_tools.files.array_file import read_archive
 from msg_tools.files.budget import Budget
 
 _LARGEST = 2**28  # maximum size, bytes; an archive of an hour has 10**8
-_RECORDS = 10  # number of records that a person counts as
+_RECORDS = 10  # cost of a person in the budget, records
 
 
 def read_arrays(path: Path) -> FoundPersons:
     """Reads an archive; row t of each array is frame t.
 
     Raises:
-        ValueError: no archive, no keypoints in it, or contradictory shapes of arrays.
+        ValueError: not an archive, no keypoints in it, or contradictory shapes of arrays.
     """
     content = read_archive(path, _LARGEST)
     budget = Budget(path.stat().st_size)
@@ -29,7 +29,7 @@ def read_arrays(path: Path) -> FoundPersons:
     n = n if given is None else given.size
     names = None if given is None else tuple(given.flat)
     if names is not None and not all(isinstance(x, str) for x in names):
-        raise ValueError('landmark_names holds other things than texts')
+        raise ValueError('landmark_names has entries that are not texts')
     budget.spend(records=_RECORDS * rows)
     shapes = {
         'pixels': (rows, n, 2),

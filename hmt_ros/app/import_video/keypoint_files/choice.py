@@ -1,4 +1,4 @@
-"""The choice of one person among all detected ones."""
+"""Chooses one person among all detected persons."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _FASTEST = 0.5
 _AROUND = 0.15
 # Maximum number of frames without the person before a track ends.
 _PATIENCE = 30
-# Maximum number of compared pairs of a person and a track in a clip, and more for each person.
+# Maximum number of person-track pairs compared in a clip: a constant, and an addition per person.
 _FREE_PAIRS, _PAIRS = 20_000, 100
-_LISTED = 8  # maximum number of names in an error
+_LISTED = 8  # maximum number of names in an error message
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class Choice:
     Attributes:
         kind: `LARGEST`: the largest box in each frame. `NEAREST`: the largest person in the first
             frame, then the person nearest to the previous one. `INDEX`: an index in the list of
-            each frame. `TRACK`: the name from the detector. `AT`: the person at a point of the
-            image at a time, and from there the nearest. `LONGEST`: a rank among the tracks of the
-            clip, the longest first.
+            each frame. `TRACK`: the name from the detector. `AT`: the person at an image point at a
+            time, then the nearest before and after. `LONGEST`: a rank among the tracks of the clip,
+            the longest first.
         value: the index, rank or name.
         point: column and row, px, and time since the first frame, s.
     """
@@ -78,10 +78,10 @@ def chosen_person(
 
     Args:
         first: key of the first frame to search.
-        rate: frames per second, for a choice by time in frames with numbers.
+        rate: frames per second; needed only for `AT` with a time if frames are numbered.
 
     Raises:
-        ValueError: no person matches the choice; the line lists alternatives.
+        ValueError: no person matches the choice; the text lists alternatives.
     """
     kind, value = choice.kind, choice.value
     if kind == INDEX:
@@ -144,7 +144,7 @@ def _called(found: FoundPersons, name: str) -> dict[int, Person]:
 
 
 def _names_in(found: FoundPersons) -> str:
-    """The names of the persons in a file as text, cut off if they are many."""
+    """The names of the persons in a file as text, cut off after `_LISTED` names."""
     names = sorted({x.track for x in found.persons()} - {''}, key=natural_order)
     return ', '.join(x[:40] for x in names[:_LISTED]) + (', ...' if len(names) > _LISTED else '')
 
@@ -163,13 +163,13 @@ def _person_at(persons: Sequence[Person], column: float, row: float) -> Person:
 
 
 def tracks_of(likely: Mapping[int, list[Person]], unit: float = 1.0) -> list[dict[int, Person]]:
-    """The tracks of a clip: each person in the frames that show them.
+    """The tracks of a clip; a track maps frame keys to one person.
 
-    In each frame persons are assigned to tracks greedily, the nearest pair first, within reach.
+    In each frame persons within reach are assigned to tracks greedily, the nearest pair first.
     Equal names from the detector take precedence over distance; different names never match.
 
     Args:
-        unit: difference of keys from frame to frame.
+        unit: difference between the keys of consecutive frames.
 
     Raises:
         ValueError: too many persons at once to follow each.
@@ -207,7 +207,7 @@ def tracks_of(likely: Mapping[int, list[Person]], unit: float = 1.0) -> list[dic
 def _followed(
     frames: Iterable[tuple[int, list[Person]]], person: Person, unit: float
 ) -> Iterator[tuple[int, Person]]:
-    """Follows a person: yields the nearest person in each frame within reach of the last one."""
+    """Follows a person: yields the nearest person in each frame, unless it is out of reach."""
     before: int | None = None
     for key, persons in frames:
         if before is not None:
@@ -221,5 +221,5 @@ def _followed(
 
 
 def _in_reach(person: Person, last: Person, gap: float) -> bool:
-    """Whether the last person can have moved to the place of a person in so many frames."""
+    """Whether the person `last` can have moved to the place of `person` in `gap` frames."""
     return person.distance(last) <= _FASTEST * last.size * gap

@@ -2,18 +2,18 @@
 
 Files of detectors do not define the meaning of their numbers: percent or fractions, points in
 smaller images, lists in one of several orders. In the right interpretation the clip shows people:
-confidences up to 1, points all over the image, bones with the lengths of people. An interpretation
-that fits is reported to the user; if none fits, the error names the option that helps.
+confidences up to 1, points all over the image, bones of human lengths. An interpretation that fits
+is reported to the user; if none fits, the error names the option that helps.
 
-Bones: with d the length of bone b in an image, L that of people and s = sum d / sum L, the 90 %
-quantile q of d / (s L) over the images is near c = 1.18, because a bone that is oblique to the
+Bones: with d the length of bone b in an image, L its usual human length and s = sum d / sum L, the
+90 % quantile q of d / (s L) over the images is near c = 1.18, because a bone that is oblique to the
 image plane in one image is parallel to it in another:
 
     z = (mean_b ((log q_b / c) / sigma_b)^4)^(1/4)
 
-L and sigma are those of `bone_lengths`; sigma is 1.67 times as large if q is below c. In 21 clips
-of a detector z is 0.4 to 1.9; in other orders of the same number of points it is 2 to 14, mostly
-above 4.
+L and sigma are from `bone_lengths`; sigma is 1.67 times as large if q is below c. In 21 clips of a
+detector z is 0.4 to 1.9; for wrong orders of the same number of points it is 2 to 14, mostly above
+4.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ from hmt_ros.image.keypoint_schemes import (
 )
 from hmt_ros.inference.arrays import Array, Mask
 
-# Maximum confidences on the scales of detectors.
+# Upper ends of the confidence scales of detectors.
 _SCALES = (100.0, 255.0, 1000.0)
-# Maximum median of confidences that are fractions.
+# Maximum median of confidences on the scale from 0 to 1.
 _FRACTIONS = 1.5
 _SMALLEST_SCALE = 10.0
 # Maximum coordinate of positions that are fractions of the image.
@@ -49,20 +49,20 @@ _FRACTION = 2.0
 # Minimum fraction of confident points in or near the image, minimum confidence of these points, and
 # margin around the image, in image sizes. Detectors are not confident of points that they guess.
 _INSIDE, _CONFIDENT, _NEAR = 0.7, 0.5, 0.05
-# Fraction of width and height within which all points are a sign of smaller images.
+# Fraction of width and height that contains all points only if they are from smaller images.
 _QUARTER = 0.5
 _SAME_SHAPE = 0.02
-_ENOUGH = 100  # minimum number of points for a conclusion from all of them
+_ENOUGH = 100  # minimum number of points for a conclusion about all points
 # Minimum confidence of the ends of a bone, and minimum number of bones for a check.
 _SURE, _BONES = 0.3, 6
 _FEWEST, _MOST = 10, 2000  # minimum and maximum number of persons that are checked
 _QUANTILE, _USUAL, _BELOW = 0.9, 1.18, 1.67
-# Maximum z of an order of points, ratio of z below which another order replaces it, and maximum z
-# of given names.
+# Maximum z of an accepted order of points, ratio of z below which another order replaces the usual
+# order, and maximum z of given names.
 _REFUSED, _BETTER, _NAMES_REFUSED = 2.75, 0.6, 3.5
-# A leap: minimum motion of all points, in diagonals of the box; maximum distance after the return,
-# as a fraction of the leap; maximum number of frames until then; minimum number of leaps for an
-# error, and minimum fraction of all steps.
+# A leap: minimum mean motion of the points, in diagonals of the box; maximum distance after the
+# return, as a fraction of the leap; maximum number of frames until the return. An error: minimum
+# number of leaps, and their minimum fraction of all steps.
 _LEAP, _BACK, _SOON, _LEAPS, _OFTEN = 0.2, 0.4, 10, 3, 0.1
 
 
@@ -82,7 +82,7 @@ def check_clip(
         points_size: size of the images in which the points were found, px; None if unknown.
 
     Raises:
-        ValueError: no interpretation fits (the line names the option to use), or an unknown scheme.
+        ValueError: no interpretation fits (the text names the option to use), or an unknown scheme.
     """
     scheme_of((), scheme)
     if not any(found.persons()):
@@ -102,17 +102,20 @@ def _likely(found: FoundPersons) -> list[Person]:
 
 
 def _scale_confidences(found: FoundPersons, tell: Tell) -> None:
-    """Scales confidences to 0 to 1."""
+    """Scales confidences to the range from 0 to 1."""
     persons = [x.keypoints for x in _likely(found)]
     sure = np.concatenate([x.confidences[x.seen] for x in persons])
     largest, scale = float(sure.max()), 1.0
     if np.median(sure) > _FRACTIONS:
         scale = next((x for x in _SCALES if _SMALLEST_SCALE < largest <= x), 1.0)
-        how = f'read as parts of {scale:g}' if scale > 1.0 else 'those above 1 count as 1'
+        how = f'read as parts of {scale:g}' if scale > 1.0 else 'those above 1 are taken as 1'
         tell(f'{found.path}: confidences up to {largest:g}: {how}')
     equal = len(sure) >= _ENOUGH and sure.min() == largest != 1.0
     if equal:
-        tell(f'{found.path}: all confidences are {largest:g}: they tell nothing, and count as 1')
+        tell(
+            f'{found.path}: all confidences are {largest:g}: they carry no information, and are '
+            'taken as 1'
+        )
 
     divisor = largest if equal else scale
     found.change(lambda x: replace(x, confidences=np.clip(x.confidences / divisor, 0.0, 1.0)))
@@ -130,16 +133,18 @@ def _scale_places(
         factor = np.array(size, dtype=np.float64)
         if points.min() < -1.0 / _FRACTION**2:  # coordinates from -1 to 1 over the width
             factor, shift = np.full(2, width / 2), np.array(size) / 2
-        tell(f'{found.path}: places are fractions of the image, of {width}x{height} pixels')
+        tell(f'{found.path}: positions are fractions of the image, of {width}x{height} pixels')
     elif given is not None:
         if given[0] <= 0 or abs(given[1] / given[0] * width / height - 1.0) > _SAME_SHAPE:
             raise ValueError(
                 f'the keypoints were found in images of {given[0]}x{given[1]} pixels, but the '
-                f'frames have {width}x{height}; --keypoints-size WxH tells another size'
+                f'frames have {width}x{height}; --keypoints-size WxH sets another size'
             )
         factor = np.array(size) / given
         if (factor != 1.0).any():
-            tell(f'{found.path}: places are scaled from {given[0]}x{given[1]} to {width}x{height}')
+            tell(
+                f'{found.path}: positions are scaled from {given[0]}x{given[1]} to {width}x{height}'
+            )
     else:
         sure = np.concatenate([x.keypoints.confidences[x.keypoints.seen] for x in persons])
         _check_places(points, sure >= min(_CONFIDENT, sure.max()), size)
@@ -153,19 +158,19 @@ def _check_places(points: Array, sure: Mask, size: tuple[int, int]) -> None:
     if outside.sum() > (1 - _INSIDE) * sure.sum():
         raise ValueError(
             f'{outside.sum()} of {sure.sum()} keypoints lie outside of the images, of '
-            f'{width}x{height}: found in larger images, or not upright? --keypoints-size WxH tells '
-            'the size of those images'
+            f'{width}x{height}: found in larger images, or not upright? --keypoints-size WxH '
+            'sets the size of those images'
         )
     if len(points) >= _ENOUGH and (shares < _QUARTER).all():
         raise ValueError(
             f'all keypoints lie in the upper left quarter of {width}x{height}: found in smaller '
-            f'images? --keypoints-size WxH tells their size, such as {width // 2}x{height // 2}, '
+            f'images? --keypoints-size WxH sets their size, such as {width // 2}x{height // 2}, '
             f'or {width}x{height} where the person is there'
         )
 
 
 def _name_points(found: FoundPersons, tell: Tell, scheme: str) -> None:
-    """Names unnamed points in the order that gives bones the lengths of people."""
+    """Names unnamed points in the order for which bones have human lengths."""
     persons = _likely(found)
     names = persons[0].keypoints.names
     alike = [x.keypoints for x in persons if x.keypoints.names == names]
@@ -186,13 +191,13 @@ def _name_points(found: FoundPersons, tell: Tell, scheme: str) -> None:
         own = recognised(names)
         what = f'{found.unnamed} points are not in the order of {" or ".join(orders)}'
         raise ValueError(
-            f'bones do not have the lengths of people: {what if orders else "the names are wrong"}'
-            ', or points of two people are in one list; '
-            f'--scheme {usual or (own.name if own else JOINTS)} takes them as they are'
+            f'bone lengths are not human: {what if orders else "the names are wrong"}, or points '
+            f'of two people are in one list; --scheme {usual or (own.name if own else JOINTS)} '
+            'accepts them as they are'
         )
     tell(
-        f'{found.path}: bones have the lengths of people in the order of {best}, not in that '
-        f'of {usual}; --scheme {usual} takes that one'
+        f'{found.path}: bone lengths are human in the order of {best}, not in that of {usual}; '
+        f'--scheme {usual} selects the latter'
     )
     _rename(found, best)
 
@@ -204,7 +209,7 @@ def _rename(found: FoundPersons, scheme: str) -> None:
 
 
 def bone_deviation(names: Sequence[str], pixels: Array, scheme: str = AUTO) -> float:
-    """Deviation z of bone lengths from those of people, standard deviations; NaN if unknown.
+    """Deviation z of bone lengths from human lengths, in standard deviations; NaN if unknown.
 
     Args:
         names: (n,) names of the points.
@@ -236,7 +241,7 @@ def check_steps(persons: Sequence[Person]) -> None:
     """Raises ValueError if a person leaps back and forth, as when a list mixes two people.
 
     Args:
-        persons: the person over time.
+        persons: one person in successive frames.
     """
     leaps = 0
     for i, (before, one) in enumerate(pairwise(persons)):
@@ -245,6 +250,7 @@ def check_steps(persons: Sequence[Person]) -> None:
         leaps += any(x.distance(before) < _BACK * step for x in soon)
     if leaps >= _LEAPS and leaps > _OFTEN * len(persons):
         raise ValueError(
-            f'{leaps} times the person is elsewhere in the next frame, and back: points of two '
-            'people under one name? Write a list for each; --person at:X,Y or track:1 follows one'
+            f'{leaps} times the person jumps away in one frame and back in the next: points of '
+            'two people under one name? Write a list for each; --person at:X,Y or track:1 '
+            'follows one'
         )

@@ -22,7 +22,7 @@ from msg_tools.files.plain_json import read_plain_json
 
 LARGEST_FILE, LARGEST_LABELS = 2**24, 2**20  # maximum size of the file of a frame, bytes
 _BOX = 5  # number of values before the keypoints: class, centre and size of a box
-# Names of files of video frames, which Ultralytics counts from 1.
+# File names of video frames, which Ultralytics numbers from 1.
 _OF_VIDEO = re.compile(r'.*_[1-9]\d*')
 
 
@@ -30,7 +30,7 @@ def read_folder(path: Path, source: FrameSource) -> FoundPersons:
     """Reads files such as walk_000000000012_keypoints.json, or walk_13.txt.
 
     Raises:
-        ValueError: there are no such files, or their format is unknown.
+        ValueError: the folder has no such files, or their format is unknown.
     """
     files = [x for x in path.iterdir() if x.suffix in ('.json', '.txt') and x.is_file()]
     kind = '.json' if any(x.suffix == '.json' for x in files) else '.txt'
@@ -67,7 +67,7 @@ def _add_labels(found: FoundPersons, file: Path, number: int) -> None:
         try:
             values = np.array(line.split(), dtype=np.float64)
         except ValueError as error:
-            raise ValueError(f'line {i + 1} is not of numbers') from error
+            raise ValueError(f'line {i + 1} has other text than numbers') from error
         if not values.size or values[0] != 0:
             continue
         more = len(values) - _BOX

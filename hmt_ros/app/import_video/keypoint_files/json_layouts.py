@@ -59,7 +59,7 @@ def add_json(found: FoundPersons, content: Any, source: FrameSource) -> None:
     for i, (label, _) in enumerate(frames):
         if not isinstance(label, (int, str)):
             raise ValueError(
-                f'entry {i} has no image_id or no keypoints: a file for each frame goes into a '
+                f'entry {i} has no image_id or no keypoints: put files of single frames into a '
                 'folder'
             )
     # The demos of MMPose count frames from 1, its inferencer from 0.
@@ -71,7 +71,7 @@ def add_json(found: FoundPersons, content: Any, source: FrameSource) -> None:
 
 
 def _get(entry: Any, names: Sequence[str], default: Any = None) -> Any:
-    """The value of an object under the first of some names that it has, or else the default."""
+    """Value of the first given name that an object has, or else the default."""
     if not isinstance(entry, dict):
         return default
     return next((entry[x] for x in names if entry.get(x) is not None), default)
@@ -98,10 +98,10 @@ def _annotations(found: FoundPersons, content: dict[str, Any]) -> tuple[Any, lis
 
 
 def frames_in(content: Any, label: Any) -> Iterator[Labelled]:
-    """Yields labels of frames, and the objects of the persons in them.
+    """Yields the label of each frame, and the JSON objects of its persons.
 
     Args:
-        label: label of the frame of the file; None if the file has many frames.
+        label: label of the only frame in the file; None if the file has many frames.
 
     Raises:
         ValueError: the layout is unknown.
@@ -154,9 +154,9 @@ def person_in(
     """Reads a person from a JSON object; returns None if no keypoint was seen.
 
     Args:
-        where: name of the object in errors.
+        where: name of the object in error messages.
         names: names of the points, if the file has them.
-        flags: whether confidences are flags of annotators.
+        flags: whether confidences are visibility flags from annotators.
 
     Raises:
         ValueError: the object is not a person.
@@ -190,7 +190,7 @@ def person_in(
 
 
 def _list(content: dict[str, Any], name: str) -> list[Any]:
-    """The list of objects in a field of an object."""
+    """The list of objects in a field of an object; raises ValueError if missing."""
     entries = content.get(name)
     if not isinstance(entries, list) or not all(isinstance(x, dict) for x in entries):
         raise ValueError(f'no list {name}')

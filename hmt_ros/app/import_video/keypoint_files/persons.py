@@ -19,7 +19,7 @@ from hmt_ros.image.keypoint_schemes import landmark_called, schemes, unnamed_ord
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
 
-_MATCHING_NS = 10_000_000  # maximum difference of the times of a row and its frame
+_MATCHING_NS = 10_000_000  # maximum time difference between a row and its frame, ns
 MOST_FRAMES = 10_000_000
 # Minimum score of a person, as a fraction of the best score of the clip.
 _LIKELY = 0.2
@@ -34,7 +34,7 @@ class Person:
 
     Attributes:
         keypoints: keypoints under the detector's names, with unknown covariances (NaN).
-        track: name of the person in all frames; '' if the detector does not track.
+        track: identity of the person over all frames; '' if the detector does not track.
         score: confidence of the detector in the person, on any scale.
     """
 
@@ -54,7 +54,7 @@ class Person:
         return float(np.linalg.norm(self.box[1] - self.box[0]))
 
     def distance(self, other: Person) -> float:
-        """Mean distance of common keypoints, px, or else the distance of the boxes."""
+        """Mean distance of common keypoints, px, or else the distance of the box centres."""
         names, theirs = self.keypoints.names, other.keypoints
         pixels, seen = theirs.pixels, theirs.seen
         if names != theirs.names:  # rows of a table may have different keypoints
@@ -81,10 +81,10 @@ def person(
     A keypoint at (0, 0) or NaN, or with confidence 0, was not seen.
 
     Args:
-        names: names of the keypoints; None: the usual order of n points (`unnamed_orders`).
-        pixels: (n, 2) px.
-        confidences: (n,) confidences on any scale; None: all 1.
-        positions: (n, 3) m; None if the detector gives no 3D positions.
+        names: names of the keypoints; None selects the usual order of n points.
+        pixels: (n, 2) image positions, px.
+        confidences: (n,) confidences on any scale; None sets all to 1.
+        positions: (n, 3) 3D positions, m; None if the detector gives none.
 
     Raises:
         ValueError: no order of n points is known.
@@ -105,7 +105,7 @@ def person(
 
 
 def orders_of(count: int) -> tuple[str, ...]:
-    """Possible schemes of a list of so many points without names, the usual one first.
+    """Possible schemes of a list of `count` unnamed points, the usual scheme first.
 
     Raises:
         ValueError: no scheme is known.
@@ -149,11 +149,11 @@ class FoundPersons:
     """Persons by frame.
 
     Attributes:
-        path: file or folder of the detector, for errors.
+        path: file or folder of the detector, for error messages.
         frames: persons by number of the frame, or by time since the first frame, ns.
-        timed: whether keys are times.
+        timed: whether the keys of `frames` are times.
         rows: number of frames of a file with an entry for every frame; None for other files.
-        size: width and height of the frames of the detector, px; None if unknown.
+        size: width and height of the images that the detector used, px; None if unknown.
         unnamed: number of points in lists without names; 0 if points have names.
         fractions: whether positions are fractions of the image, not px.
     """
@@ -204,7 +204,7 @@ class FoundPersons:
             yield from found
 
     def likely(self) -> dict[int, list[Person]]:
-        """The persons with a sufficient score, by frame in order."""
+        """Persons with a sufficient score, by frame in increasing order."""
         best = max((x.score for x in self.persons()), default=0.0)
         return {
             key: [x for x in found if x.score >= _LIKELY * best or best <= 0.0]
@@ -212,16 +212,16 @@ class FoundPersons:
         }
 
     def change(self, changed: Callable[[Keypoints], Keypoints]) -> None:
-        """Replaces the keypoints of each person by the result of a function of them."""
+        """Applies a function to the keypoints of each person."""
         for key, found in self.frames.items():
             self.frames[key] = [replace(x, keypoints=changed(x.keypoints)) for x in found]
 
 
 def numbers_of(labels: Sequence[str | int], source: FrameSource, *, from_one: bool) -> list[int]:
-    """Numbers, from 0, of the frames with some labels.
+    """Frame numbers, from 0, of the given labels.
 
     Args:
-        from_one: whether the detector counts from 1, unless the source defines the numbers.
+        from_one: whether the detector counts from 1; ignored if the source defines the numbers.
 
     Raises:
         ValueError: a label refers to no frame.

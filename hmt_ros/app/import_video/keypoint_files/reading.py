@@ -47,7 +47,7 @@ def read_keypoints(path: Path, source: FrameSource, first_stamp_ns: int) -> Foun
     """Reads the output of a detector for the frames of a source.
 
     Args:
-        first_stamp_ns: stamp of the first frame, to which stamps in the file refer.
+        first_stamp_ns: stamp of the first frame, which is subtracted from stamps in the file.
 
     Raises:
         ValueError: the file is missing, unreadable, of unknown format, or contradictory.
@@ -72,7 +72,7 @@ def read_keypoints(path: Path, source: FrameSource, first_stamp_ns: int) -> Foun
             )
         farthest = max((float(np.nanmax(np.abs(x.box))) for x in found.persons()), default=0.0)
         if farthest > _FARTHEST:
-            raise ValueError(f'a keypoint lies {farthest:g} px away, wanted places in an image')
+            raise ValueError(f'a keypoint lies {farthest:g} px away, wanted positions in an image')
         for names in {x.keypoints.names for x in found.persons()}:
             if len({*names}) < len(names):
                 twice = next(x for x, other in pairwise(sorted(names)) if x == other)
@@ -90,15 +90,15 @@ def keypoints_of_person(
     first: int = 0,
     rate: float | None = None,
 ) -> dict[int, Keypoints]:
-    """Keypoints of the chosen person by key of the frame, in pixels of the images.
+    """Keypoints of the chosen person by frame key, in pixels of the images.
 
     Args:
         size: width and height of the images, px.
         first: key of the first frame.
-        rate: frames per second, if known.
+        rate: frames per second; None if unknown.
 
     Raises:
-        ValueError: the clip is contradictory, or has no such person; the line names a remedy.
+        ValueError: the clip is contradictory, or has no such person; the text names a remedy.
     """
     told: list[str] = []
     check_clip(found, size, told.append, scheme=reading.scheme, points_size=reading.points_size)
@@ -116,7 +116,7 @@ def keypoints_of_person(
 
 
 def mirrored(keypoints: Keypoints, width: int) -> Keypoints:
-    """Converts keypoints of a mirrored image of a width, px, to those of the original image."""
+    """Converts keypoints of a mirrored image, `width` px wide, to keypoints of the original."""
     positions = keypoints.positions
     return replace(
         keypoints,

@@ -23,12 +23,12 @@ from msg_tools.messages.headers import SECOND_NS
 LARGEST_FILE = 2**26  # maximum size, bytes
 _CELL = 64  # memory of a cell, bytes
 FRAME, TIME, STAMP = 'frame', 'time_s', 'stamp_ns'
-# Minimum of Unix times, and maximum of times in seconds.
+# Minimum of Unix times, and maximum of times that are in seconds.
 _UNIX, _LATEST = 1e8, 1e11  # s
-# Maximum coordinate of positions in metres, from a calibrated system.
+# Maximum coordinate of positions that are in metres, as from a calibrated system.
 _METRES = 20.0
 
-# Line, frame or time, person, keypoint, and texts of column, row and confidence.
+# A cell: line number, frame or time, person, keypoint, and texts of column, row and confidence.
 Cells = tuple[int, str, str, str, tuple[str, str, str]]
 
 
@@ -36,10 +36,10 @@ def read_table(path: Path, source: FrameSource, first_stamp_ns: int) -> FoundPer
     """Reads a table of a known kind.
 
     Args:
-        first_stamp_ns: stamp of the first frame, to which stamps in the file refer.
+        first_stamp_ns: stamp of the first frame, which is subtracted from stamps in the file.
 
     Raises:
-        ValueError: the file is not such a table, or contradicts itself.
+        ValueError: the file is not a known table, or is contradictory.
     """
     try:
         text = read_bytes(path, LARGEST_FILE).decode('utf-8-sig')
@@ -110,7 +110,7 @@ def _of_rows(table: list[list[str]], when: str, budget: Budget) -> Iterator[Cell
 
 
 def _of_deeplabcut(table: list[list[str]], budget: Budget) -> Iterator[Cells]:
-    """Yields cells below a header of scorer, individuals (if several), bodyparts and coords."""
+    """Yields cells of a DeepLabCut table; its header is scorer, individuals, bodyparts, coords."""
     depth = next(i for i, x in enumerate(table) if x[:1] == ['coords'])
     heads = {x[0]: x for x in table[: depth + 1] if x}
     coordinates = heads['coords']
@@ -130,7 +130,7 @@ def _of_deeplabcut(table: list[list[str]], budget: Budget) -> Iterator[Cells]:
 
 
 def _of_markers(table: list[list[str]]) -> Iterator[Cells]:
-    """Yields cells of rows of frame, time, and X, Y, Z = 0 of each marker, px, from Sports2D."""
+    """Yields cells of a .trc of Sports2D: frame, time, and X, Y, Z = 0 of each marker, px."""
     head = next((i for i, x in enumerate(table) if x[:1] == ['Frame#']), None)
     if head is None:
         raise ValueError('no line Frame#, wanted a table of markers (.trc)')
@@ -139,13 +139,13 @@ def _of_markers(table: list[list[str]]) -> Iterator[Cells]:
     rows = [(i, x) for i, x in enumerate(table) if i > head and x and x[0].isdecimal()]
     numbers = [[_number(x, i + 1) for x in row[2 : 2 + 3 * len(markers)]] for i, row in rows]
     if any(len(x) != 3 * len(markers) for x in numbers):
-        raise ValueError('rows of markers have another length than the head')
+        raise ValueError('rows of markers have another length than the header')
     points = np.array(numbers).reshape(-1, 3)
     farthest = np.nanmax(np.abs(points), axis=0, initial=0.0)
     if farthest[2] > 0 or farthest[:2].max() <= _METRES:
         raise ValueError(
-            'the markers have three coordinates or metres; wanted places in the image: the file '
-            'of Sports2D whose name has _px_'
+            'the markers have three coordinates or metres; wanted image positions: the file of '
+            'Sports2D with _px_ in its name'
         )
     upwards = np.nanmax(points[:, 1], initial=-math.inf) <= 0
     for i, row in rows:
@@ -166,7 +166,7 @@ def _landmarks(parts: Sequence[str]) -> dict[str, str]:
 
 
 def _keys(labels: Sequence[str], when: str, source: FrameSource, first_stamp_ns: int) -> list[int]:
-    """Keys of frames from a column; Unix times are relative to the first."""
+    """Frame keys from a column of labels; Unix times become relative to the first time."""
     if when == FRAME:
         return [source.number_of(x) for x in labels]
     try:
