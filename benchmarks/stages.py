@@ -68,7 +68,7 @@ class StageClock:
         self._charge()
         self._stack.append(stage)
 
-    def _leave(self) -> None:
+    def _hand_over(self) -> None:
         self._charge()
         self._stack.pop()
 
@@ -85,7 +85,7 @@ class StageClock:
             try:
                 return function(*args, **kwargs)
             finally:
-                self._leave()
+                self._hand_over()
 
         return timed
 

@@ -54,7 +54,7 @@ from benchmarks.tracking_means import CHOSEN
 from benchmarks.truth_fits import SHOULDERS, best_poses, with_true_lengths
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.model_file import held
+from hmt_ros.body.model_file import conditioned_covariance
 from hmt_ros.body.skeleton import other_side
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, HIPS, ORIGIN
 from hmt_ros.experts.pose_encoding import ray_rotations
@@ -206,7 +206,7 @@ def _true_depths(given: Given, weight: float = LIFTED_WEIGHT) -> Given:
 def _true_lengths(given: Given) -> Given:
     body, usual = given.fitted[0], given.body.segment_lengths
     rows = np.eye(len(usual))[[usual[x] != body.segment_lengths[x] for x in usual]]
-    spread = held(body.length_covariance, rows, np.full(len(rows), LENGTH_SIGMA))
+    spread = conditioned_covariance(body.length_covariance, rows, np.full(len(rows), LENGTH_SIGMA))
     return replace(given, body=replace(body, length_covariance=spread), lengths_known=True)
 
 

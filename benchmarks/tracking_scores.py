@@ -15,7 +15,7 @@ from scipy.stats import t as student
 from benchmarks.clips import read_detections, rows_at_rate
 from benchmarks.runs import JOINTS, Record
 from hmt_ros.app.truth import read_truth
-from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, HIPS, LOST
+from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, HIPS, LOST_ERROR
 from hmt_ros.inference.calibration import coverage
 from hmt_ros.tracking import Status
 
@@ -104,7 +104,7 @@ def scores_of(record: Record) -> dict[str, Any]:
         * (np.linalg.norm(root - true_root, axis=1) / np.linalg.norm(true_root, axis=1)).mean(),
         'depth_percent': 100.0 * (root[:, 2] / true_root[:, 2] - 1.0).mean(),
         **path_scores(record),
-        'kept': (heaviest < LOST).sum() / record.images[0],
+        'kept': (heaviest < LOST_ERROR).sum() / record.images[0],
         'weights': np.log(weights[rows, nearest] * present.sum(1)).mean(),
         'coverage_50': coverage(record.levels, 0.5),
         'coverage_90': coverage(record.levels, 0.9),
@@ -263,7 +263,7 @@ def detector_scores(folder: Path, limit: int | None = None, rate: float = 0.0) -
         'aligned_mm': 1e3 * _distances(procrustes_aligned(own, true), true).mean()
         if some
         else np.nan,
-        'kept': (errors < LOST).sum() / len(images),
+        'kept': (errors < LOST_ERROR).sum() / len(images),
         'acceleration': acceleration_ratio(np.array(stamps), own, true),
     }
 

@@ -12,7 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
-from hmt_ros.app.report.skeletons import LEFT, RIGHT, STYLE, bones_of
+from hmt_ros.app.report.skeletons import LEFT_COLOUR, RIGHT_COLOUR, STYLE, bones_of
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.kinematics import forward
 
@@ -51,7 +51,13 @@ def add_body(
     for rank, part in enumerate(order):
         name = body.skeleton.segment_names[body.shapes[part].segment]
         hull = cv2.convexHull(flat[mesh.parts == part].astype(np.float32))[:, 0]
-        colour = LEFT if name.startswith('left') else RIGHT if name.startswith('right') else TRUNK
+        colour = (
+            LEFT_COLOUR
+            if name.startswith('left')
+            else RIGHT_COLOUR
+            if name.startswith('right')
+            else TRUNK
+        )
         axes.add_patch(
             Polygon(
                 hull,

@@ -25,11 +25,11 @@ from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
 from hmt_ros.inference.mode_chain import backward_weights, drawn_paths
 from hmt_ros.sessions.camera_file import read_camera
-from hmt_ros.sessions.smoother_session import LIVELINESS
+from hmt_ros.sessions.smoother_session import DIFFUSION_FACTOR
 from hmt_ros.smoothing import ImageModes, Link, MotionSmoother, TrajectoryMixture
 from hmt_ros.smoothing.image_refinement import refined_on_images
 from hmt_ros.smoothing.likelihood import LikelihoodPart
-from hmt_ros.smoothing.motion_smoother import PATHS, SmoothedMotions
+from hmt_ros.smoothing.motion_smoother import PATH_SAMPLES, SmoothedMotions
 from hmt_ros.smoothing.trajectory_refinement import refine
 from hmt_ros.smoothing.variational_mixture import VariationalMixture, minimise_free_energy
 
@@ -105,7 +105,7 @@ class ClipTrajectories:
     @property
     def paths_through(self) -> Index:
         """Mode indices (N, T) of paths drawn from the chain."""
-        return drawn_paths([one.link for one in self.modes], PATHS, self.smoother.seed)[0]
+        return drawn_paths([one.link for one in self.modes], PATH_SAMPLES, self.smoother.seed)[0]
 
     def observed(self, poses: Array) -> Array:
         """-log p (M,) of the images along poses (M, T, d), nats."""
@@ -165,7 +165,7 @@ def clip_trajectories(name: str, inputs: str) -> ClipTrajectories:
     body, modes, shown = followed(clip, inputs)
     prior = motion_prior(body)
     smoother = MotionSmoother(
-        replace(prior, diffusion=LIVELINESS * prior.diffusion),
+        replace(prior, diffusion=DIFFUSION_FACTOR * prior.diffusion),
         *free_limits(body),
         points=body.relative_joints,
     )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hmt_learning.app import make_bag
-from hmt_ros.app.report.skeletons import LEFT, RIGHT
+from hmt_ros.app.report.skeletons import LEFT_COLOUR, RIGHT_COLOUR
 from hmt_ros.app.truth import read_truth
 from hmt_ros.evaluation.pose_scores import HIPS
 from hmt_ros.image.keypoint_schemes import schemes
@@ -74,8 +74,8 @@ def test_it_leaves_a_bag_and_a_report(output):
         picture = cv2.imread(str(folder / 'report' / name))
         assert min(picture.shape[:2]) > 200, name
         if name not in ('weights.png', 'calibration.png'):
-            assert contains(picture, LEFT), name
-            assert contains(picture, RIGHT), name
+            assert contains(picture, LEFT_COLOUR), name
+            assert contains(picture, RIGHT_COLOUR), name
 
 
 def told(printed):

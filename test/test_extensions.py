@@ -18,7 +18,7 @@ from hmt_ros.detectors.detector import DetectorKind
 from hmt_ros.detectors.registry import DETECTORS
 from hmt_ros.image import background
 from hmt_ros.image.background import BackgroundModel, BackgroundSettings
-from hmt_ros.image.pixel_backgrounds import FOREGROUND
+from hmt_ros.image.pixel_backgrounds import FOREGROUND_LABEL
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.camera_session import IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
@@ -82,7 +82,7 @@ class Bright:
         self.empty = image.copy()
 
     def labels(self, image):
-        return np.where(image.max(2) > 200, np.uint8(FOREGROUND), np.uint8(0))
+        return np.where(image.max(2) > 200, np.uint8(FOREGROUND_LABEL), np.uint8(0))
 
 
 def test_a_background_is_a_file_and_a_line(monkeypatch):

@@ -81,16 +81,16 @@ def test_limits_are_those_of_the_page():
         images.MAX_PIXELS,
         images.MAX_JPEG_SCANS,
         images.FREE_PIXELS,
-        camera_session._LARGEST_PICTURE_FILE,
+        camera_session._MAX_PICTURE_BYTES,
         pose_mixtures.MAX_COMPONENTS,
         keypoints.MAX_KEYPOINTS,
         detections.MAX_PEOPLE,
-        model_file.LARGEST_FILE,
-        subject.LARGEST_FILE,
-        parameter_file.LARGEST_FILE,
-        rig.LARGEST_FILE,
-        rig.LARGEST_MOTION,
-        array_file.LARGEST_ARCHIVE,
+        model_file.MAX_FILE_BYTES,
+        subject.MAX_FILE_BYTES,
+        parameter_file.MAX_FILE_BYTES,
+        rig.MAX_FILE_BYTES,
+        rig.MAX_MOTION,
+        array_file.MAX_ARCHIVE_BYTES,
     }
     assert limits <= stated
 
@@ -99,7 +99,7 @@ def test_limits_of_bags_are_those_of_the_page():
     page = (ROOT / 'docs' / 'security.md').read_text('utf-8')
     (row,) = (line for line in page.splitlines() if line.startswith('| bag |'))
     stated = [int(text.replace(' ', '')) for text in re.findall(r'\*\*([\d ]+)\*\*', row)]
-    assert stated == [storage.LARGEST, bag_metadata.MAX_BYTES]
+    assert stated == [storage.MAX_CHUNK_BYTES, bag_metadata.MAX_BYTES]
 
 
 def test_each_promise_of_the_page_names_a_test_that_exists():
@@ -124,5 +124,9 @@ def test_limits_of_messages_are_those_of_the_page():
 
     page = (ROOT / 'docs' / 'security.md').read_text('utf-8')
     stated = {int(text.replace(' ', '')) for text in re.findall(r'\*\*([\d ]+)\*\*', page)}
-    assert {image_inputs.LARGEST, image_inputs.LARGEST_MASK, image_inputs.LARGEST_DEPTH} <= stated
-    assert subscribed_topic.LARGEST_IMAGE in stated
+    assert {
+        image_inputs.MAX_MESSAGE_BYTES,
+        image_inputs.MAX_MASK_BYTES,
+        image_inputs.MAX_DEPTH_BYTES,
+    } <= stated
+    assert subscribed_topic.MAX_IMAGE_BYTES in stated

@@ -19,14 +19,14 @@ import numpy as np
 import hmt_ros
 from hmt_learning.training.training_set import MOTION_SUFFIXES, PoseSequence, motion_files
 from hmt_ros.app.command_line import number, whole_number
-from hmt_ros.app.progress import tell_user, with_progress
+from hmt_ros.app.progress import notify_user, with_progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.experts.pose_predictor import RATE
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.error_line import error_line
 from msg_tools.files.new_folder import check_file_place
 
-LARGEST_TABLE = 2**22  # bytes
+MAX_TABLE = 2**22  # bytes
 Item = TypeVar('Item')
 
 
@@ -184,7 +184,7 @@ def read_motions(
         shown = with_progress(reading, 'reading', 'motions', len(paths), quiet=quiet)
         for path, (one, why) in zip(paths, shown, strict=True):
             if one is None:
-                tell_user(command, f'skipped {path.name}: {why}')
+                notify_user(command, f'skipped {path.name}: {why}')
             else:
                 found.append(one)
     if paths and not found:
@@ -214,7 +214,7 @@ def people_in(tables: Iterable[Path]) -> dict[str, str]:
     found: dict[str, str] = {}
     for path in tables:
         try:
-            text = read_bytes(path, LARGEST_TABLE).decode('utf-8')
+            text = read_bytes(path, MAX_TABLE).decode('utf-8')
             columns, *rows = csv.reader(io.StringIO(text, newline='')) if text else [[]]
         except (ValueError, csv.Error) as error:
             raise ValueError(f'{path}: {error}') from error

@@ -9,9 +9,9 @@ height of the camera). `/tf_static` has the camera's pose in `odom`, as on a rob
 A bag of several people, such as two who walk past each other, has instead of `/ground_truth` and
 `/body` the topics `/humans/bodies/a/ground_truth`, `.../b/ground_truth` and `/detections`
 (hmt_msgs/People2D: COCO keypoints of all, without identities). A keypoint that another person hides
-is not detected, and a person with fewer than `FEWEST` visible keypoints is not detected at all.
-The order of the people in a message is random. Beside it are `background.png`, and `truth_a.npz`
-and `truth_b.npz`, without silhouettes.
+is not detected, and a person with fewer than `MIN_KEYPOINTS` visible keypoints is not detected at
+all. The order of the people in a message is random. Beside it are `background.png`, and
+`truth_a.npz` and `truth_b.npz`, without silhouettes.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ TURN = np.radians(12.0)
 STATURES = (0.94, 1.06)
 # Noise of keypoints, m on the person; their confidence; minimum number for a detection.
 NOISE, CONFIDENCE = 0.02, 0.9
-FEWEST = 5
+MIN_KEYPOINTS = 5
 OF_PEOPLE, OF_DETECTIONS = 6, 7  # identifiers of random streams
 
 
@@ -315,7 +315,7 @@ def write_people(
                 detection(take.body, pose, camera, owners == number, rng)
                 for number, (take, pose) in enumerate(zip(takes, poses, strict=True))
             ]
-            people = [DetectedPerson('', x) for x in found if x.seen.sum() >= FEWEST]
+            people = [DetectedPerson('', x) for x in found if x.seen.sum() >= MIN_KEYPOINTS]
             shuffled = [people[i] for i in rng.permutation(len(people))]
             message = people_message(messages, shuffled, stamp, FRAME_ID)
             bag.write('detections', stamp, message)

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from hmt_learning.motion.rig import (
-    LARGEST_MOTION,
-    MOST_SEGMENTS,
+    MAX_MOTION,
+    MAX_SEGMENTS,
     Channel,
     MotionFileError,
     Rig,
@@ -138,8 +138,8 @@ def _frames(path: Path, lines: Sequence[str], at: int, skeleton: Acclaim) -> Arr
                 raise MotionFileError(path, i + 1, f'frame {words[0][:20]}, wanted frame {wanted}')
             missing = set(skeleton.columns)
             frames.append(np.zeros(skeleton.dimension))
-            if len(frames) * skeleton.dimension > LARGEST_MOTION:
-                raise MotionFileError(path, i + 1, f'more than {LARGEST_MOTION} numbers')
+            if len(frames) * skeleton.dimension > MAX_MOTION:
+                raise MotionFileError(path, i + 1, f'more than {MAX_MOTION} numbers')
             continue
         if not frames:
             raise MotionFileError(path, i + 1, f'saw {lines[i].strip()[:60]!r}, wanted frame 1')
@@ -230,8 +230,8 @@ def _bones(path: Path, lines: Lines) -> Iterator[_Bone]:
             if bone is not None:
                 raise MotionFileError(path, line, f'begin inside of the bone of line {bone.line}')
             bone, count = _Bone(line), count + 1
-            if count > MOST_SEGMENTS:
-                raise MotionFileError(path, line, f'more than {MOST_SEGMENTS} bones')
+            if count > MAX_SEGMENTS:
+                raise MotionFileError(path, line, f'more than {MAX_SEGMENTS} bones')
         elif bone is None:
             raise MotionFileError(path, line, f'saw {" ".join(words)[:60]!r}, wanted begin')
         elif key == 'end':

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from hmt_learning.motion.rig import (
-    LARGEST_MOTION,
-    MOST_SEGMENTS,
+    MAX_MOTION,
+    MAX_SEGMENTS,
     Channel,
     MotionFileError,
     Rig,
@@ -26,8 +26,8 @@ from hmt_learning.motion.rig import (
 )
 from hmt_ros.inference.arrays import Array
 
-_MOST_WORDS = 20_000  # maximum number of words in a line, because parsing time is quadratic
-_LONGEST_NAME = 200  # characters
+_MAX_WORDS = 20_000  # maximum number of words in a line, because parsing time is quadratic
+_MAX_NAME = 200  # characters
 CHANNELS = {
     f'{letter}{kind}': (axis, kind == 'rotation')
     for kind in ('position', 'rotation')
@@ -68,7 +68,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
     started = False
     for i, line in enumerate(lines):
         words = line.replace('{', ' { ').replace('}', ' } ').split()
-        if len(words) > _MOST_WORDS:
+        if len(words) > _MAX_WORDS:
             raise MotionFileError(path, i + 1, f'{len(words)} words in a line')
         while words:
             word, key = words[0], words[0].upper()
@@ -111,12 +111,12 @@ def _opened(
         )
     if stack and joints[stack[-1]].is_tip:
         raise MotionFileError(path, line, f'saw {" ".join(words)!r} inside of an End Site')
-    if len(joints) >= MOST_SEGMENTS:
-        raise MotionFileError(path, line, f'more than {MOST_SEGMENTS} joints')
+    if len(joints) >= MAX_SEGMENTS:
+        raise MotionFileError(path, line, f'more than {MAX_SEGMENTS} joints')
     parent = stack[-1] if stack else -1
     if key == 'END':
         return _Joint(f'{joints[parent].name}_end', parent, line, True)
-    if not 0 < len(name) <= _LONGEST_NAME:
+    if not 0 < len(name) <= _MAX_NAME:
         raise MotionFileError(path, line, f'saw {words[0]} with a name of {len(name)} characters')
     return _Joint(name, parent, line, False)
 
@@ -163,11 +163,9 @@ def _motion(path: Path, lines: list[str], at: int, count: int) -> tuple[Array, f
             frames = int(number)
             if frames != number or frames < 1:
                 raise MotionFileError(path, line, f'saw {number:g} frames, wanted one at least')
-            if frames * count > LARGEST_MOTION:
+            if frames * count > MAX_MOTION:
                 seen = f'{frames} frames of {count} channels'
-                raise MotionFileError(
-                    path, line, f'{seen}, wanted {LARGEST_MOTION} numbers at most'
-                )
+                raise MotionFileError(path, line, f'{seen}, wanted {MAX_MOTION} numbers at most')
         else:
             frame_time = number
             if frame_time <= 0:

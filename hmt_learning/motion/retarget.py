@@ -40,7 +40,7 @@ SIGMA = {
     'hand': 0.010,
 }
 OPTIONAL = {'toe': 'ankle', 'hand': 'wrist'}  # may be missing; the joint before each
-SHORTEST = 0.02  # minimum length of a foot or hand for a usable direction, m
+MIN_TIP_LENGTH = 0.02  # minimum length of a foot or hand for a usable direction, m
 FRONT = 0.1  # distance of the point in front of the pelvis that carries its rotation, m
 FRONT_SIGMA = 0.015
 BELIEF = 4.0  # factor on the standard deviations of the body's soft prior
@@ -185,7 +185,7 @@ def _recorded(motion: Motion) -> dict[str, Array]:
     for side in SIDES:
         for end, carrier in OPTIONAL.items():
             tip = place.get(f'{side}_{end}')
-            if tip is not None and _median_norm(tip - place[f'{side}_{carrier}']) < SHORTEST:
+            if tip is not None and _median_norm(tip - place[f'{side}_{carrier}']) < MIN_TIP_LENGTH:
                 del place[f'{side}_{end}']
     return place
 

@@ -29,10 +29,10 @@ from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.inference.arrays import Array
 from msg_tools.files.bounded_file import read_bytes
 
-LARGEST_FILE = 500_000_000  # bytes
-LARGEST_MOTION = 30_000_000  # numbers, frames times channels
-_LARGEST_TEXT, _LINE = 700_000_000, 64  # text in memory, and overhead of a line, bytes
-MOST_SEGMENTS = 2_000
+MAX_FILE_BYTES = 500_000_000  # bytes
+MAX_MOTION = 30_000_000  # numbers, frames times channels
+_MAX_TEXT, _LINE = 700_000_000, 64  # text in memory, and overhead of a line, bytes
+MAX_SEGMENTS = 2_000
 
 # Limits if the file sets none, as for the root of a human body: ten turns, rad; a large hall, m.
 FREE_ANGLE = 20 * np.pi
@@ -139,12 +139,12 @@ def read_text(path: Path) -> str:
     if not path.is_file():
         raise FileNotFoundError(f'no motion file {path}')
     try:
-        content = read_bytes(path, LARGEST_FILE)
+        content = read_bytes(path, MAX_FILE_BYTES)
     except ValueError as error:
         raise MotionFileError(path, None, str(error)) from error
     # All characters at which Python splits lines.
     lines = sum(content.count(x) for x in b'\n\r\v\f\x1c\x1d\x1e\x85')
-    if 2 * len(content) + _LINE * lines > _LARGEST_TEXT:
+    if 2 * len(content) + _LINE * lines > _MAX_TEXT:
         raise MotionFileError(path, None, f'{lines} lines in {len(content)} bytes are too many')
     if b'\0' in content:
         line = content.count(b'\n', 0, content.index(b'\0')) + 1

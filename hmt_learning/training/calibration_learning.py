@@ -28,7 +28,7 @@ TEMPERATURES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
 ITERATIONS = 6
 COVERED = 0.9  # nominal probability of the region used for the factor
 LIGHT = 0.02  # minimum relative weight of a component in a region
-LARGEST_FACTOR = 4.0
+MAX_FACTOR = 4.0
 
 
 class LearningCalibration(CalibratedExperts):
@@ -98,7 +98,7 @@ def calibration(left_out: list[tuple[Components, Array]]) -> Calibration:
     squares = np.concatenate([_squared_distances(found.of(c), z) for c, z in left_out])
     # Quantile of the chi-squared distribution with D degrees of freedom.
     wanted = float(2.0 * gammaincinv(left_out[0][1].shape[1] / 2.0, COVERED))
-    factor = float(np.clip(np.quantile(squares, COVERED) / wanted, 1.0, LARGEST_FACTOR))
+    factor = float(np.clip(np.quantile(squares, COVERED) / wanted, 1.0, MAX_FACTOR))
     return replace(found, factor=factor)
 
 

@@ -26,9 +26,9 @@ from hmt_ros.body import Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import mirror
 from hmt_ros.experts.lifter import (
-    INSTEAD,
     LANDMARKS,
-    PROPORTIONED,
+    PROPORTION_LENGTHS,
+    SUBSTITUTES,
     landmark_offsets,
     log_ratios,
     relative,
@@ -52,7 +52,7 @@ JOINTS = (
     'pelvis',
 )
 # Joint centres, for keypoint schemes that use them; a track has them after the skin landmarks.
-CENTRES = tuple(name for name in INSTEAD if name != 'centre_of_neck')
+CENTRES = tuple(name for name in SUBSTITUTES if name != 'centre_of_neck')
 SHOULDERS = ('left_shoulder', 'right_shoulder')
 # Lengths taken from the track of the legs, and from that of the arms.
 OF_PELVIS = ('thigh', 'shin', 'foot', 'hip_width', 'hip_drop')
@@ -69,12 +69,12 @@ SEATED_HIP, SEATED_KNEE, SEATED_LEAN, SEATED_OTHER = (85.0, 12.0), (-88.0, 22.0)
 # Radius of trunk and leg, within which a joint of an arm counts as inside, m.
 TRUNK_RADIUS, LEG_RADIUS = 0.10, 0.07
 # Minimum standard deviation of a landmark over people, clothes and detectors, m.
-LEAST_SIGMA = 0.022
+MIN_SIGMA = 0.022
 # Factor on the spread of lengths over people, for variants; minimum share of a length that remains.
-OF_SPREAD, SHORTEST_LENGTH = 0.8, 0.4
+OF_SPREAD, MIN_LENGTH = 0.8, 0.4
 # Wandering angles: standard deviations of joints, and of root and trunk; correlation time, s.
 WANDER, LEAN, WANDERING = np.radians(7.0), np.radians(4.0), 2.0
-SHORTEST = 10  # minimum number of frames of a motion
+MIN_FRAMES = 10  # minimum number of frames of a motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +101,7 @@ class KeypointTracks:
         pelvis, chest: (F, 3, 3) rotations of the pelvis, and of the chest in the pelvis's frame.
         roots: (F, 3) root positions relative to their mean over the track, m.
         starts, counts: (M,) first frame and number of frames of each track.
-        lengths: (M, P) log ratios of the lengths (`lifter.PROPORTIONED`) to the usual ones.
+        lengths: (M, P) log ratios of the lengths (`lifter.PROPORTION_LENGTHS`) to the usual ones.
         weights: (M,) share of the windows that are drawn from each track; 0 for seated tracks.
         seated: (M,) whether a track is of a seated person; only its legs are used.
         usual: body with the usual lengths.
@@ -141,9 +141,9 @@ def keypoint_tracks(
         ValueError: no motion is long enough.
     """
     rng = np.random.default_rng(seed)
-    usable = [(x, s) for x, s in zip(sequences, shares, strict=True) if len(x.poses) >= SHORTEST]
+    usable = [(x, s) for x, s in zip(sequences, shares, strict=True) if len(x.poses) >= MIN_FRAMES]
     if not usable:
-        raise ValueError(f'no motion has {SHORTEST} frames')
+        raise ValueError(f'no motion has {MIN_FRAMES} frames')
     parts: list[tuple[Figures, Figures, Array, Array, Array]] = []
     lengths, weights = [], []
     own = body.segment_lengths
@@ -240,7 +240,7 @@ def _other_lengths(
     factor = np.linalg.cholesky(body.length_covariance + 1e-12 * np.eye(len(names)))
     other = OF_SPREAD * factor @ rng.normal(size=len(names))
     return {
-        name: max(lengths[name] + more, SHORTEST_LENGTH * lengths[name])
+        name: max(lengths[name] + more, MIN_LENGTH * lengths[name])
         for name, more in zip(names, other.tolist(), strict=True)
     }
 
@@ -286,7 +286,7 @@ def _places(body: Body, poses: Array, rng: np.random.Generator | None) -> Array:
     names = (*LANDMARKS, *CENTRES)
     joints, offsets = landmark_offsets(body, names)
     if rng is not None:
-        sigma = np.array([max(landmarks()[name].sigma, LEAST_SIGMA) for name in names])
+        sigma = np.array([max(landmarks()[name].sigma, MIN_SIGMA) for name in names])
         offsets = offsets + sigma[:, None] * rng.normal(size=offsets.shape)
     skeleton = body.skeleton
     which = skeleton.joint_index(tuple(joints))
@@ -354,6 +354,6 @@ def proportions_of(tracks: KeypointTracks, which: Index) -> Array:
     """Proportions (N, P) of people with the legs, trunks and arms of tracks (3, N)."""
     logs = tracks.lengths[which[1]]
     for part, names in ((0, OF_PELVIS), (2, OF_ARM)):
-        columns = [PROPORTIONED.index(name) for name in names]
+        columns = [PROPORTION_LENGTHS.index(name) for name in names]
         logs[:, columns] = tracks.lengths[which[part]][:, columns]
     return relative(tracks.usual, logs)

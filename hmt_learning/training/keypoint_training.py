@@ -23,14 +23,21 @@ from hmt_learning.training.keypoint_tracks import (
     proportions_of,
 )
 from hmt_learning.training.training_set import about
-from hmt_ros.experts.lifter import FEWEST, INSTEAD, LANDMARKS, NEAR, TIMES, window_inputs
+from hmt_ros.experts.lifter import (
+    LANDMARKS,
+    MIN_LANDMARKS,
+    SUBSTITUTES,
+    TIME_TOLERANCES,
+    TIMES,
+    window_inputs,
+)
 from hmt_ros.experts.pose_predictor import RATE
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.lifted_poses import HIPS
 from hmt_ros.inference.arrays import Array, Index
 
 # Indices of the landmarks that joint centres replace.
-REPLACED = tuple(LANDMARKS.index(INSTEAD[name]) for name in CENTRES)
+REPLACED = tuple(LANDMARKS.index(SUBSTITUTES[name]) for name in CENTRES)
 
 
 @dataclass(frozen=True)
@@ -140,7 +147,7 @@ def training_windows(
     confidences = there[..., None] * SCHEMES[chosen][:, None].astype(f32)
     if s.noise > 0:
         rays, confidences = with_errors(rays, confidences, distance, times, rng, s.noise, border)
-    few = (confidences[:, 0] > 0).sum(1) < FEWEST
+    few = (confidences[:, 0] > 0).sum(1) < MIN_LANDMARKS
     confidences[few, 0] = np.maximum(confidences[few, 0], 0.9 * SCHEMES[chosen[few]])
     up = np.where(rng.random(n)[:, None] < s.gravity, -turn[:, :, 1], 0.0)
     for axis in (0, 2):
@@ -183,7 +190,7 @@ _ON_SKIN = ('mediapipe33', 'coco17', 'body25', 'skeleton2d')
 
 
 def _shown(scheme: str) -> NDArray[np.bool_]:
-    names = {INSTEAD.get(mark.name, mark.name) for mark in schemes()[scheme].landmarks}
+    names = {SUBSTITUTES.get(mark.name, mark.name) for mark in schemes()[scheme].landmarks}
     return np.array([name in names for name in LANDMARKS])
 
 
@@ -208,7 +215,7 @@ def _images(
     rate = np.exp(rng.uniform(np.log(s.rates[0]), np.log(s.rates[1]), n))
     rate[rng.random(n) < s.usual_rate] = RATE
     times = np.round(TIMES * rate[:, None]) / rate[:, None]
-    there = np.abs(times - TIMES) <= NEAR
+    there = np.abs(times - TIMES) <= TIME_TOLERANCES
     reach = float(TIMES.max())
     back = np.where(rng.random(n) < s.cut, rng.uniform(0.0, reach, n), np.inf)
     ahead = np.where(rng.random(n) < 0.5 * s.cut, rng.uniform(0.0, reach, n), np.inf)

@@ -25,7 +25,7 @@ from hmt_learning.training.network_learning import (
 )
 from hmt_learning.training.training_set import PoseSequence
 from hmt_ros.body import Body
-from hmt_ros.experts.lifter import MEANS, SPREAD, SPREADS, Lifter, Network
+from hmt_ros.experts.lifter import LOG_SIGMA_LIMITS, MEAN_SCALE, USUAL_LOG_SIGMA, Lifter, Network
 from hmt_ros.inference.arrays import Array
 
 # Number of windows for the scores of a lifter.
@@ -34,7 +34,7 @@ SCORED_WINDOWS = 2000
 SCORED = tuple(i for i, name in enumerate(JOINTS) if not name.endswith(('toe', 'hand', 'pelvis')))
 PELVIS = JOINTS.index('pelvis')
 # Added to the scale of each input.
-LEAST_SCALE = 0.1
+MIN_SCALE = 0.1
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def learn_lifter(
 
     inputs, joints = drawn(s.steps)
     k, j = s.experts, len(JOINTS)
-    mean, scale = inputs.mean(0), inputs.std(0) + np.float32(LEAST_SCALE)
+    mean, scale = inputs.mean(0), inputs.std(0) + np.float32(MIN_SCALE)
     middle = joints.mean(0)
     first = first_layers(inputs.shape[1], s.units, s.layers, k * (1 + 6 * j), s.seed)
     if taught is not None:
@@ -105,9 +105,9 @@ def learn_lifter(
 
     def terms(p: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
         out = layer_outputs(p, (x - mean) / scale)
-        means = MEANS * out[:, k : k * (1 + 3 * j)].reshape(-1, k, j, 3) + middle
+        means = MEAN_SCALE * out[:, k : k * (1 + 3 * j)].reshape(-1, k, j, 3) + middle
         spreads = out[:, k * (1 + 3 * j) :].reshape(-1, k, j, 3)
-        spreads = jnp.clip(spreads + SPREAD, *SPREADS)
+        spreads = jnp.clip(spreads + USUAL_LOG_SIGMA, *LOG_SIGMA_LIMITS)
         off = means - y[:, None]
         density = -(0.5 * (off * jnp.exp(-spreads)) ** 2 + spreads).sum((2, 3))
         distance = jnp.sqrt((off * off).sum(3) + 1e-6).mean(2)

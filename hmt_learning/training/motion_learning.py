@@ -35,10 +35,10 @@ USUAL = 0.995
 # Factor by which correlations are shrunk towards 0.
 SHRINKAGE = 0.05
 # Minimum white-noise variance per second, m^2 or rad^2: 3 mm or 0.2 degrees.
-LEAST_WHITE = 1e-5
+MIN_WHITE = 1e-5
 # Bounds of the damping, per second.
 DAMPING = (0.2, 60.0)
-FEWEST = 200  # minimum number of pairs of displacements
+MIN_PAIRS = 200  # minimum number of pairs of displacements
 
 
 def learned_motion(
@@ -54,10 +54,10 @@ def learned_motion(
         ValueError: there is too little motion.
     """
     pairs = {k: _displacements(body, sequences, k) for k in INTERVALS}
-    if len(pairs[INTERVALS[-1]]) < FEWEST:
+    if len(pairs[INTERVALS[-1]]) < MIN_PAIRS:
         raise ValueError(
             f'the motions have {len(pairs[INTERVALS[-1]])} moments to learn from, wanted at least '
-            f'{FEWEST}: give more of them'
+            f'{MIN_PAIRS}: give more of them'
         )
     groups = _groups(body)
     d = body.dimension
@@ -122,13 +122,13 @@ def _fitted(moments: Array) -> tuple[float, float, float]:
     """Damping, variance of the velocity and white noise from moments (I, 4)."""
     interval, var, cov, count = moments.T
     count = count / count.sum()
-    floor = 1e-3 * LEAST_WHITE * interval
+    floor = 1e-3 * MIN_WHITE * interval
     var = np.maximum(var, floor)
     cov = np.clip(cov, -var + floor, var - floor)
 
     def cost(log: Array) -> float:
         g, s, w = np.exp(log)
-        seen = [modelled_moments(float(t), g, s, w + LEAST_WHITE) for t in interval]
+        seen = [modelled_moments(float(t), g, s, w + MIN_WHITE) for t in interval]
         v, c = np.array(seen).T
         # Sum and difference of the two displacements are independent.
         both = np.log(v + c) + (var + cov) / (v + c) + np.log(v - c) + (var - cov) / (v - c)
@@ -142,7 +142,7 @@ def _fitted(moments: Array) -> tuple[float, float, float]:
         minimize(cost, np.clip(x, -29.0, 9.0), method='L-BFGS-B', bounds=bounds) for x in starts
     ]
     g, s, w = np.exp(min(found, key=lambda one: float(one.fun)).x)
-    return float(g), float(s), float(w) + LEAST_WHITE
+    return float(g), float(s), float(w) + MIN_WHITE
 
 
 def _couplings(

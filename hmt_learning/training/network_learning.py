@@ -23,7 +23,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hmt_ros.experts.network_experts import LEAK, WIDTHS, Layers, NetworkExperts, read_outputs
+from hmt_ros.experts.network_experts import (
+    LEAK_SLOPE,
+    LOG_WIDTH_LIMIT,
+    Layers,
+    NetworkExperts,
+    read_outputs,
+)
 from hmt_ros.experts.training_pairs import Standardisation, checked_pairs
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.clustering import k_means
@@ -40,7 +46,7 @@ END = 0.005
 NEEDED = 'a network needs JAX and Optax to learn, which are missing: pip install jax optax'
 
 # Minimum number of samples; number of clusters for the support of an input, and of their samples.
-FEWEST, CENTRES, FOR_CENTRES = 20, 200, 20_000
+MIN_SAMPLES, CENTRES, FOR_CENTRES = 20, 200, 20_000
 # Factor a on the distances of means, and exponent b of densities in the responsibilities.
 DISTANCE, SHARPNESS = 5.0, 0.5
 
@@ -159,9 +165,9 @@ def layer_outputs(p: Any, x: Any) -> Any:
     """Outputs (N, O) of layers at whitened inputs (N, p), in JAX; see `Layers.outputs`."""
     from jax.nn import leaky_relu
 
-    h = leaky_relu(x @ p['first'] + p['first_bias'], LEAK)
+    h = leaky_relu(x @ p['first'] + p['first_bias'], LEAK_SLOPE)
     for weights, bias in zip(p['hidden'], p['hidden_biases'], strict=True):
-        h = h + leaky_relu(h @ weights + bias, LEAK)
+        h = h + leaky_relu(h @ weights + bias, LEAK_SLOPE)
     return h @ p['last'] + p['last_bias']
 
 
@@ -203,7 +209,9 @@ class LearningNetwork(NetworkExperts):
         Raises:
             ValueError: as `ConditionalDensity.fit`, or JAX or Optax is missing.
         """
-        pairs = checked_pairs(inputs, targets, sample_weight, at_least=FEWEST, what='to learn from')
+        pairs = checked_pairs(
+            inputs, targets, sample_weight, at_least=MIN_SAMPLES, what='to learn from'
+        )
         self.n_inputs_, self.n_outputs_ = pairs.inputs.shape[1], pairs.targets.shape[1]
         of_inputs = Standardisation.of(pairs.inputs, pairs.weights)
         of_targets = Standardisation.of(pairs.targets, pairs.weights, 'common')
@@ -230,7 +238,7 @@ class LearningNetwork(NetworkExperts):
             import jax.numpy as jnp
 
             gates, means, widths = read_outputs(layer_outputs(p, seen), m, d)
-            widths = jnp.clip(widths, -WIDTHS, WIDTHS)
+            widths = jnp.clip(widths, -LOG_WIDTH_LIMIT, LOG_WIDTH_LIMIT)
             off = true[:, None] - means
             whitened = jnp.einsum('mij,nmj->nmi', _triangular(p['factors'], jnp), off)
             logs = jnp.diagonal(p['factors'], axis1=1, axis2=2).sum(1)

@@ -28,7 +28,7 @@ from hmt_ros.experts.expert_mixture import (
 )
 from hmt_ros.experts.neighbour_models import LocalExperts, NearestNeighbours
 from hmt_ros.experts.pose_encoding import PoseEncoding
-from hmt_ros.experts.pose_predictor import JITTER, PosePredictor
+from hmt_ros.experts.pose_predictor import ADDED_VARIANCE, PosePredictor
 from hmt_ros.experts.training_pairs import finite_matrix
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
@@ -43,7 +43,7 @@ WIDTH = 3.0  # kernel width of the conditional model's gates, in standard deviat
 FOR_DESCRIPTOR = 3000  # maximum number of silhouettes from which the descriptor is learned
 FOR_BASIS = 600  # maximum number of poses for the average metric of targets
 AWAY = 5.0  # depth of the poses in that average, m
-SMALLEST = 3e-3  # metric of a component that moves no joint, m per radian
+MIN_METRIC = 3e-3  # metric of a component that moves no joint, m per radian
 # Noise added to previous states when dynamics are learned, because a previous state is an estimate:
 # standard deviation relative to that of the states.
 STATE_NOISE = 0.5
@@ -228,7 +228,7 @@ def learned_predictor(
         _learn(dynamics, inputs, states, training.motions)
     mean, spread = training.targets.mean(0), np.cov(training.targets.T)
     equilibrium = GaussianMixture(
-        np.ones(1), mean[None], (spread + JITTER * np.eye(len(mean)))[None]
+        np.ones(1), mean[None], (spread + ADDED_VARIANCE * np.eye(len(mean)))[None]
     )
     return PosePredictor(body, training.descriptor, model, basis, equilibrium, dynamics, notes)
 
@@ -257,7 +257,7 @@ def target_basis(encoding: PoseEncoding, targets: Array) -> Array:
     slopes = slopes.reshape(len(chosen), -1, body.dimension) @ by_target
     metric = np.einsum('nij,nik->jk', slopes, slopes, optimize=True)
     metric /= len(chosen) * (len(body.joint_names) - 1)
-    return np.linalg.cholesky(metric + SMALLEST**2 * np.eye(encoding.size))
+    return np.linalg.cholesky(metric + MIN_METRIC**2 * np.eye(encoding.size))
 
 
 def affinities(vectors: Array) -> Array:

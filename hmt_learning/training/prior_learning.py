@@ -37,7 +37,7 @@ STILL = np.radians(0.5)
 
 Progress = Callable[[Iterable[int], int], Iterable[int]]
 # A component with less than this share of one sample keeps its mean and covariance.
-LEAST_SAMPLES = 1e-3
+MIN_SAMPLES = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ def fitted_mixture(
         each = np.concatenate([shares[:, :k], shares[:, k : 2 * k]])
         filled = each.sum(0)
         means, covariances = mixture.means[1:].copy(), mixture.covariances[1:].copy()
-        for i in np.flatnonzero(filled > LEAST_SAMPLES):
+        for i in np.flatnonzero(filled > MIN_SAMPLES):
             means[i] = each[:, i] @ points / filled[i]
             offset = points - means[i]
             scatter = (offset * each[:, i : i + 1]).T @ offset

@@ -27,10 +27,10 @@ from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.mirror import mirror, root_angles, root_rotations
 from hmt_ros.body.rasterisation import render_silhouettes
-from hmt_ros.experts.descriptor.contour import SMALLEST
+from hmt_ros.experts.descriptor.contour import MIN_AREA
 from hmt_ros.experts.descriptor.internal_edges import EDGES
 from hmt_ros.experts.descriptor.silhouette_descriptor import (
-    FEWEST_POINTS,
+    MIN_POINTS,
     SilhouetteParts,
     silhouette_parts,
 )
@@ -267,7 +267,7 @@ def training_set(
         person = random_build(body, s, rng)
         for row, (mask, grey) in zip(rows, _drawn_people(person, poses[rows], s, rng), strict=True):
             packed[row] = np.packbits(mask, axis=1)
-            edges[row] = silhouette_parts(mask, FEWEST_POINTS, grey).edges
+            edges[row] = silhouette_parts(mask, MIN_POINTS, grey).edges
     activities = tuple(sequences[i].activity for i in which.tolist())
     return TrainingSet(poses, previous, packed, edges, activities, which, frames)
 
@@ -294,7 +294,7 @@ def _drawn_people(
         if rng.random() < s.cut and low > high:
             upper = seen.copy()
             upper[max(round(low - rng.uniform(*CUT) * (low - high)), 0) :] = 0
-            seen = upper if np.count_nonzero(upper) > SMALLEST else seen
+            seen = upper if np.count_nonzero(upper) > MIN_AREA else seen
         yield seen, None if grey is None else np.asarray(grey, np.uint8)
 
 

@@ -31,8 +31,8 @@ COMMANDS = {
     'evaluate': ('hmt_ros.app.evaluate', 'compare the mixtures in a bag with ground truth'),
 }
 
-ABOUT = 'Monocular 3D human motion tracking with mixtures.'
-MORE = """\
+DESCRIPTION = 'Monocular 3D human motion tracking with mixtures.'
+FURTHER_HELP = """\
 ROS 2 runs the same commands, ros2 run hmt_ros <command>, and the nodes filter_node, smoother_node
 and bme_node. In a checkout python -m hmt_learning has the commands that render and learn.
 """
@@ -40,4 +40,4 @@ and bme_node. In a checkout python -m hmt_learning has the commands that render 
 
 def main(argv: list[str] | None = None) -> int:
     """Runs a command; returns 0 when done, 1 for bad input (one line on stderr explains it)."""
-    return run_program('hmt_ros', COMMANDS, ABOUT, MORE, argv)
+    return run_program('hmt_ros', COMMANDS, DESCRIPTION, FURTHER_HELP, argv)

@@ -13,7 +13,7 @@ from typing import NoReturn, TypeVar
 import hmt_ros
 from hmt_ros.app.last_resort import last_resort
 
-LARGEST = 10_000  # maximum side of an image, px
+MAX_IMAGE_SIDE = 10_000  # maximum side of an image, px
 
 Number = TypeVar('Number', int, float)
 
@@ -218,6 +218,6 @@ def image_size(text: str) -> tuple[int, int]:
     width, _, height = text.lower().partition('x')
     if not (width.isdecimal() and height.isdecimal()):
         raise argparse.ArgumentTypeError(f'wanted a size such as 640x480, saw {text!r}')
-    if not (8 <= int(width) <= LARGEST and 8 <= int(height) <= LARGEST):
-        raise argparse.ArgumentTypeError(f'wanted sides of 8 to {LARGEST} px, saw {text!r}')
+    if not (8 <= int(width) <= MAX_IMAGE_SIDE and 8 <= int(height) <= MAX_IMAGE_SIDE):
+        raise argparse.ArgumentTypeError(f'wanted sides of 8 to {MAX_IMAGE_SIDE} px, saw {text!r}')
     return int(width), int(height)

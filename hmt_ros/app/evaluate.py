@@ -33,7 +33,7 @@ from msg_tools.messages.trajectory_mixtures import (
 )
 
 # Maximum length of a name in a table, and of a row of a table, characters.
-LONGEST_CELL, WIDEST_TABLE = 60, 1000
+MAX_CELL_LENGTH, MAX_ROW_LENGTH = 60, 1000
 
 EPILOG = """\
 Errors are mean distances of hips, knees, ankles, shoulders, elbows, wrists and neck from their true
@@ -110,7 +110,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(as_json(found, truth, model_sigma, verticals), indent=1))
     else:
-        say(as_text(found, truth, verticals), most=WIDEST_TABLE)
+        say(as_text(found, truth, verticals), most=MAX_ROW_LENGTH)
     return 0
 
 
@@ -157,7 +157,7 @@ def as_text(
     verticals: Mapping[str, GravityScores] | None = None,
 ) -> str:
     """Tables as text: one row per topic, then the errors of each joint."""
-    found = {one_line(name, LONGEST_CELL): topic for name, topic in found.items()}
+    found = {one_line(name, MAX_CELL_LENGTH): topic for name, topic in found.items()}
     rows: list[tuple[str, ...]] = [
         (
             '',
@@ -218,7 +218,7 @@ def _percent(value: float | None) -> str:
 
 def table(rows: Sequence[Sequence[str]]) -> list[str]:
     """Lines of a table; the first column is aligned left, all others right."""
-    rows = [[one_line(cell, LONGEST_CELL) for cell in row] for row in rows]
+    rows = [[one_line(cell, MAX_CELL_LENGTH) for cell in row] for row in rows]
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return [
         '  '.join(

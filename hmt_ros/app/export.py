@@ -38,9 +38,9 @@ FORMATS = ('.bvh', '.csv', '.npz')
 # Radius of the 90 % region of a 3D Gaussian, in units of its largest standard deviation.
 RADIUS_90 = 2.5003
 # Minimum length of a gap between poses, in median intervals.
-_GAP = 1.5
+_GAP_RATIO = 1.5
 # Maximum rotation of the vertical for a static camera, degrees.
-_STILL = 5.0
+_MAX_CAMERA_TURN = 5.0
 
 EPILOG = """\
 The suffix of OUT selects the format.
@@ -422,7 +422,7 @@ def _room(path: Path, topic: str, frame_id: str) -> tuple[Array, float, str]:
     heights = [ground.height for ground in grounds if ground.height is not None]
     told = 'upright, the floor at y = 0' if heights else 'upright, the camera at y = 0'
     turned = float(np.degrees(np.arccos(np.clip(ups @ up, -1.0, 1.0).min())))
-    if turned > _STILL:
+    if turned > _MAX_CAMERA_TURN:
         told += f'; the camera moved: gravity turned by up to {turned:.0f} degrees from its mean'
     height = float(np.median(heights)) if heights else 0.0
     return np.stack([np.cross(up, back), up, back]), height, told
@@ -440,7 +440,7 @@ def _notes(steps: Sequence[TrackedPose], end: int) -> list[str]:
             f'{most:.2f} m then, and by {usual:.2f} m between other poses'
         )
     gaps = np.diff([step.stamp_ns for step in steps]) / SECOND_NS
-    long = gaps[gaps > _GAP * np.median(gaps)] if len(gaps) else gaps
+    long = gaps[gaps > _GAP_RATIO * np.median(gaps)] if len(gaps) else gaps
     if len(long):
         notes.append(f'gaps: {len(long)}, the longest {long.max():.2f} s; skeletons move on')
     if steps[-1].stamp_ns < end:

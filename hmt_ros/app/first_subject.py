@@ -21,18 +21,18 @@ from msg_tools.messages.headers import time_ns
 from msg_tools.messages.keypoints import keypoints_of
 
 # Joints that the first image of the track should show, and minimum number of them.
-WANTED = tuple(
+WANTED_JOINTS = tuple(
     f'{side}_{joint}'
     for joint in ('hip', 'shoulder', 'knee', 'ankle', 'elbow', 'wrist')
     for side in ('left', 'right')
 )
-ENOUGH = 10
-FEWEST = 4  # minimum number of joints in a subject file
-CONFIDENT = 0.5
+ENOUGH_JOINTS = 10
+MIN_JOINTS = 4  # minimum number of joints in a subject file
+MIN_CONFIDENCE = 0.5
 # Name of the landmark at the joint of the head.
 _CENTRE_OF_HEAD = 'centre_of_head'
 # Standard deviation of a keypoint as a fraction of the person's image size, and its minimum, px.
-SIGMA, LEAST_SIGMA = 0.03, 2.0
+SIGMA, MIN_SIGMA = 0.03, 2.0
 
 
 @dataclass(frozen=True)
@@ -50,19 +50,19 @@ class Seen:
     @property
     def count(self) -> int:
         """Number of wanted joints that were seen."""
-        return len({*self.joints.names} & {*WANTED})
+        return len({*self.joints.names} & {*WANTED_JOINTS})
 
     @property
     def is_enough(self) -> bool:
         """Whether a track can start well from these joints."""
-        return self.count >= ENOUGH and {*WANTED[:4]} <= {*self.joints.names}
+        return self.count >= ENOUGH_JOINTS and {*WANTED_JOINTS[:4]} <= {*self.joints.names}
 
 
 def find_start(path: Path, body: Body) -> Seen:
     """Finds the image of a bag from which a track starts, and the joints in it.
 
-    It is the first image that shows `ENOUGH` of the `WANTED` joints with confidence, including hips
-    and shoulders, or else the image with the most joints.
+    It is the first image that shows `ENOUGH_JOINTS` of the `WANTED_JOINTS` joints with confidence,
+    including hips and shoulders, or else the image with the most joints.
 
     Raises:
         ValueError: the bag has no keypoints, or too few in each image.
@@ -74,16 +74,16 @@ def find_start(path: Path, body: Body) -> Seen:
             raise ValueError(f'{path} has no keypoints: import them with the video')
         for stored in bag.messages([topic.name]):
             stamp = time_ns(stored.message.header.stamp)
-            seen = Seen(stamp, joints_of(keypoints_of(stored.message, LEAST_SIGMA), body))
+            seen = Seen(stamp, joints_of(keypoints_of(stored.message, MIN_SIGMA), body))
             if best is None or seen.count > best.count:
                 best = seen
                 if seen.is_enough:
                     break
     count = 0 if best is None else len(best.joints.names)
-    if best is None or count < FEWEST:
+    if best is None or count < MIN_JOINTS:
         raise ValueError(
             f'{path}: {count} joints of {body.name} are seen with confidence in each image, wanted '
-            f'{FEWEST} at least'
+            f'{MIN_JOINTS} at least'
         )
     return best
 
@@ -95,7 +95,7 @@ def joints_of(keypoints: Keypoints, body: Body) -> Keypoints:
     at the mean of its landmarks; for example, the hand is at the mean of the fingers.
     """
     names, known = keypoints.names, body.joint_names
-    sure = keypoints.seen & (keypoints.confidences >= CONFIDENT)
+    sure = keypoints.seen & (keypoints.confidences >= MIN_CONFIDENCE)
     places: dict[str, list[int]] = {}
     for i, mark in enumerate(landmarks_of(names, known)):
         joint = names[i] if mark is None else mark.joint
@@ -114,7 +114,7 @@ def joints_of(keypoints: Keypoints, body: Body) -> Keypoints:
 def subject_text(seen: Seen, stature: float) -> str:
     """Text of a subject file with the seen joints and the stature of the person, m."""
     pixels = seen.joints.pixels
-    sigma = max(SIGMA * float(np.ptp(pixels, axis=0).max()), LEAST_SIGMA)
+    sigma = max(SIGMA * float(np.ptp(pixels, axis=0).max()), MIN_SIGMA)
     lines = [
         '# joints in one image, as a detector found them',
         f'stamp_ns: {seen.stamp_ns}',

@@ -14,8 +14,8 @@ from contextlib import contextmanager, nullcontext
 from types import ModuleType
 from typing import Any, TextIO
 
-from hmt_ros.app.progress import LineFile, tell_user
-from msg_tools.files.error_line import LONGEST_LINE, error_line, one_line
+from hmt_ros.app.progress import LineFile, notify_user
+from msg_tools.files.error_line import MAX_LINE, error_line, one_line
 
 # Exit codes after the interrupt key and after SIGPIPE, as in shells; for other signals, the offset
 # of the exit code from the signal number.
@@ -26,7 +26,7 @@ _HINT = '; --debug shows where'
 def last_resort(
     program: str, run: Callable[[], int], *, debug: bool = False, lost: str = ''
 ) -> int:
-    """Runs a program; any exception becomes one line on stderr, at most `LONGEST_LINE` long.
+    """Runs a program; any exception becomes one line on stderr, at most `MAX_LINE` long.
 
     Args:
         debug: whether to print the traceback of an error as well.
@@ -40,13 +40,13 @@ def last_resort(
         SystemExit: the process received SIGTERM or SIGHUP.
     """
     # A new file must not get the descriptor of a closed stdout or stderr.
-    sys.stdout, sys.stderr = sys.stdout or _nowhere(1), sys.stderr or _nowhere(2)
+    sys.stdout, sys.stderr = sys.stdout or _null_device(1), sys.stderr or _null_device(2)
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is signal.SIG_DFL:
             # An exception makes context managers remove unfinished files.
             signal.signal(number, lambda seen, _: sys.exit(SIGNALLED + seen))
     # Finalisers of objects in a traceback can print; they must run while stderr is redirected.
-    with nullcontext() if debug else _told_in_lines(program):
+    with nullcontext() if debug else _errors_as_lines(program):
         try:
             try:
                 return run()
@@ -63,35 +63,35 @@ def last_resort(
                 traceback.print_exc()
             usual = isinstance(error, (ValueError, OSError))
             kind, hint = ('', '') if usual else (f'{type(error).__name__}: ', _HINT)
-            text = f'{program}: {kind}{error_line(error, LONGEST_LINE)}'
-            print(f'{one_line(text, LONGEST_LINE - len(hint))}{hint}', file=sys.stderr)
+            text = f'{program}: {kind}{error_line(error, MAX_LINE)}'
+            print(f'{one_line(text, MAX_LINE - len(hint))}{hint}', file=sys.stderr)
             code = 1
     try:
         sys.stdout.flush()
     except OSError:
         # The interpreter would write the buffer at exit, and print an error.
-        _nowhere(sys.stdout.fileno())
+        _null_device(sys.stdout.fileno())
     return code
 
 
-def _nowhere(number: int) -> TextIO:
+def _null_device(number: int) -> TextIO:
     """Opens the null device under a given file descriptor."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), number)  # the two descriptors can be equal
     return os.fdopen(number, 'w', encoding='utf-8', closefd=False)
 
 
 @contextmanager
-def _told_in_lines(program: str) -> Iterator[None]:
+def _errors_as_lines(program: str) -> Iterator[None]:
     """Prints warnings, logs, and errors in threads and finalisers as lines for the user.
 
     Output of C libraries on stderr, for example of libpng about a damaged image, is dropped.
     """
 
-    def tell(error: BaseException, *_: object) -> None:
-        tell_user(program, f'{type(error).__name__}: {error_line(error)}')
+    def notify(error: BaseException, *_: object) -> None:
+        notify_user(program, f'{type(error).__name__}: {error_line(error)}')
 
     def ended(found: Any) -> None:
-        tell(found.exc_value)
+        notify(found.exc_value)
 
     usual = sys.stderr
     shown = os.fdopen(os.dup(2), 'w', 1, usual.encoding, usual.errors)
@@ -99,10 +99,10 @@ def _told_in_lines(program: str) -> Iterator[None]:
         shown,
         _replaced(sys, stderr=shown if usual is sys.__stderr__ else usual, unraisablehook=ended),
         _replaced(threading, excepthook=ended),
-        _replaced(warnings, showwarning=tell),
+        _replaced(warnings, showwarning=notify),
         _replaced(logging, lastResort=logging.StreamHandler(LineFile())),
     ):
-        _nowhere(2)
+        _null_device(2)
         try:
             yield
         finally:

@@ -34,7 +34,7 @@ from hmt_ros.app.import_video.keypoint_files.reading import (
     keypoints_of_person,
     read_keypoints,
 )
-from hmt_ros.app.progress import say, show_progress, tell_user
+from hmt_ros.app.progress import notify_user, say, show_progress
 from hmt_ros.app.report.command import ReportOptions, write_report
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.experts.lifted_fit import lift_poses
@@ -50,23 +50,23 @@ from hmt_ros.sessions.track_reports import reversed_gravity
 from hmt_ros.tracking import read_subject
 from hmt_ros.tracking.ground import GroundEstimator, KnownGround
 from hmt_ros.tracking.initialisation import start_from_keypoints
-from hmt_ros.tracking.track_state import SAME_PERSON
+from hmt_ros.tracking.track_state import SAME_PERSON_CHAIN
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.headers import FRAME_ID, SECOND_NS, START_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
-LIFTED, REPORT = 'lifted', 'report'
+LIFTED_FOLDER, REPORT_FOLDER = 'lifted', 'report'
 # Minimum component of gravity along the optical axis for a check with poses lifted without gravity.
-STEEP = 0.8
+MIN_STEEP_COMPONENT = 0.8
 # Minimum leap, as the ratio of a distance to the local median; half width of the median's window,
 # s; fraction of images with leaps above which the user is warned.
-LEAP, NEIGHBOURS, RARE = 1.5, 1.0, 0.05
+LEAP_RATIO, NEIGHBOUR_TIME, MAX_LEAP_FRACTION = 1.5, 1.0, 0.05
 # Angle between trunk and vertical above which a person is lying, rad.
-LYING = np.radians(55.0)
+LYING_ANGLE = np.radians(55.0)
 # Maximum ratio of frames to entries for which frames without an entry get an empty mixture.
-_GAPS = 1000
+_MAX_GAP_FRAMES = 1000
 
 EPILOG = """\
 KEYPOINTS has a layout of import-video: .json, .npz, .csv, .trc, or a folder.
@@ -147,7 +147,7 @@ def _parser() -> CommandParser:
 
 def _lift(arguments: argparse.Namespace) -> int:
     folder, quiet = arguments.output, arguments.quiet
-    taken = [x for x in (LIFTED, REPORT) if (folder / x).exists()]
+    taken = [x for x in (LIFTED_FOLDER, REPORT_FOLDER) if (folder / x).exists()]
     if taken and not arguments.overwrite:
         raise ValueError(f'{folder / taken[0]} exists; give another name, or --overwrite')
     lifter = load_lifter(arguments.lifter)
@@ -156,12 +156,12 @@ def _lift(arguments: argparse.Namespace) -> int:
     size = arguments.size or found.size
     if size is None:
         raise ValueError('the size of the images is unknown: --size WxH')
-    tell = partial(tell_user, 'lift')
-    camera = camera_of(arguments, size, tell)
+    notify = partial(notify_user, 'lift')
+    camera = camera_of(arguments, size, notify)
     reading = ClipReading(
         arguments.person, arguments.scheme, arguments.keypoints_size, arguments.mirror
     )
-    chosen = keypoints_of_person(found, reading, size, tell, rate=arguments.fps)
+    chosen = keypoints_of_person(found, reading, size, notify, rate=arguments.fps)
     times, seen = _in_frames(found, chosen, arguments.fps)
     stamps = [arguments.first_stamp + time for time in times]
     nobody = not any(len(one.names) for one in seen)
@@ -192,14 +192,14 @@ def _lift(arguments: argparse.Namespace) -> int:
         )
     mixtures = _with_leaps(mixtures, stamps)
     if up is not None and not nobody:
-        checked = mixtures if abs(up[2]) < STEEP else lifted(None)
+        checked = mixtures if abs(up[2]) < MIN_STEEP_COMPONENT else lifted(None)
         _check_gravity(up, body, [one for one in checked if one is not None])
     folder.mkdir(parents=True, exist_ok=True)
     messages = RosbagsMessages()
-    with BagWriter(folder / LIFTED, overwrite=arguments.overwrite) as bag:
+    with BagWriter(folder / LIFTED_FOLDER, overwrite=arguments.overwrite) as bag:
         track, met = 1, stamps[0]
         for stamp, mixture in zip(stamps, mixtures, strict=True):
-            track += bool(SAME_PERSON.closed(1.0, seconds(stamp - met)) < 0.5)
+            track += bool(SAME_PERSON_CHAIN.closed(1.0, seconds(stamp - met)) < 0.5)
             met = met if mixture is None else stamp
             info = camera_info_message(messages, camera, stamp, FRAME_ID)
             bag.write(CAMERA_INFO, stamp, info)
@@ -208,8 +208,8 @@ def _lift(arguments: argparse.Namespace) -> int:
             )
             bag.write(PREDICTION, stamp, pose_mixture_message(messages, content))
     options = ReportOptions(
-        folder / LIFTED,
-        folder / REPORT,
+        folder / LIFTED_FOLDER,
+        folder / REPORT_FOLDER,
         overwrite=arguments.overwrite,
         quiet=quiet,
         topics=(PREDICTION,),
@@ -217,7 +217,7 @@ def _lift(arguments: argparse.Namespace) -> int:
     _, written = write_report(options)
     if not quiet:
         posed = sum(one is not None for one in mixtures)
-        say(f'{folder / LIFTED}: {len(mixtures)} images, {posed} with a pose\n{written}')
+        say(f'{folder / LIFTED_FOLDER}: {len(mixtures)} images, {posed} with a pose\n{written}')
     return 0
 
 
@@ -225,7 +225,7 @@ def _in_frames(
     found: FoundPersons, chosen: dict[int, Keypoints], fps: float
 ) -> tuple[list[int], list[Keypoints]]:
     """Times, ns, and keypoints of the chosen person; `NO_KEYPOINTS` if the person is missing."""
-    sparse = found.timed or found.last > _GAPS * len(found.frames)
+    sparse = found.timed or found.last > _MAX_GAP_FRAMES * len(found.frames)
     keys = found.keys if sparse else list(range(found.last + 1))
     times = keys if found.timed else [round(key * SECOND_NS / fps) for key in keys]
     return times, [chosen.get(key, NO_KEYPOINTS) for key in keys]
@@ -242,9 +242,9 @@ def _up(seen: Sequence[Keypoints], body: Body, arguments: argparse.Namespace) ->
         return None
     ground = GroundEstimator(KnownGround(-unit_vector(gravity, '--gravity')))
     for one in seen:
-        ground.see(one.named_for(body, arguments.scheme)[0])
+        ground.update_sign_by_keypoints(one.named_for(body, arguments.scheme)[0])
     if ground.reversed:
-        tell_user('lift', reversed_gravity(ground.estimate.up))
+        notify_user('lift', reversed_gravity(ground.estimate.up))
     return ground.estimate.up
 
 
@@ -262,9 +262,9 @@ def _with_leaps(
     times = 1e-9 * np.array([stamps[i] for i in posed])
     result, most, leaps = list(mixtures), 1.0, 0
     for i, time, distance in zip(posed, times, distances, strict=True):
-        usual = float(np.median(distances[np.abs(times - time) <= NEIGHBOURS]))
+        usual = float(np.median(distances[np.abs(times - time) <= NEIGHBOUR_TIME]))
         ratio = max(distance / usual, usual / distance)
-        if ratio < LEAP:
+        if ratio < LEAP_RATIO:
             continue
         most, leaps = max(most, ratio), leaps + 1
         one = mixtures[i]
@@ -273,8 +273,8 @@ def _with_leaps(
         along = (usual / distance - 1.0) * one.means[:, :3]
         covariances[:, :3, :3] += along[:, :, None] * along[:, None]
         result[i] = GaussianMixture(one.weights, one.means, covariances)
-    if leaps > RARE * len(posed):
-        tell_user(
+    if leaps > MAX_LEAP_FRACTION * len(posed):
+        notify_user(
             'lift',
             f'the distance jumps in {leaps} of {len(posed)} images, up to {most:.1f} times: too '
             'little of the person is seen for keypoints alone; use the images too '
@@ -289,8 +289,8 @@ def _check_gravity(up: Array, body: Body, mixtures: Sequence[GaussianMixture]) -
     neck, pelvis = body.skeleton.joint_index(('neck', 'pelvis'))
     trunk = joints[:, neck] - joints[:, pelvis]
     lean = float(np.median(np.arccos(trunk @ up / np.linalg.norm(trunk, axis=1))))
-    if lean > LYING:
-        tell_user(
+    if lean > LYING_ANGLE:
+        notify_user(
             'lift',
             f'the person leans by {np.degrees(lean):.0f} degrees against the given gravity: the '
             'person lies, or --gravity is not in the optical frame (x right, y down, z forward)',

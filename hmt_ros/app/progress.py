@@ -20,11 +20,11 @@ from typing import Any, TypeAlias, TypeVar
 
 from tqdm import tqdm
 
-from msg_tools.files.error_line import LONGEST_LINE, one_line, printable
+from msg_tools.files.error_line import MAX_LINE, one_line, printable
 
 Item = TypeVar('Item')
 Progress: TypeAlias = 'tqdm[Any]'
-Tell = Callable[[str], object]  # shows a line to the user
+Notify = Callable[[str], object]  # shows a line to the user
 
 INTERVAL = 3.0  # time between two lines, s; a bar shows the time every second
 
@@ -103,12 +103,12 @@ def with_progress(
     return _Bar(INTERVAL, **options, file=LineFile(), ncols=0, mininterval=math.inf, delay=math.inf)
 
 
-def tell_user(command: str, text: str) -> None:
+def notify_user(command: str, text: str) -> None:
     """Prints a line for the user on stderr, above the bar of `show_progress`."""
-    tqdm.write(one_line(f'{command}: {text}', LONGEST_LINE), file=sys.stderr)
+    tqdm.write(one_line(f'{command}: {text}', MAX_LINE), file=sys.stderr)
 
 
-def say(*texts: object, most: int = LONGEST_LINE) -> None:
+def say(*texts: object, most: int = MAX_LINE) -> None:
     """Prints results on stdout, in printable lines of at most `most` characters."""
     for line in '\n'.join(map(str, texts)).split('\n'):
         print(printable(line, most), flush=True)

@@ -21,8 +21,8 @@ from hmt_ros.app.import_video.command import (
     import_video,
 )
 from hmt_ros.app.import_video.frames import Selection, open_source
-from hmt_ros.app.import_video.lens import TOLD_SIGMA, told_fov
-from hmt_ros.app.progress import say, tell_user
+from hmt_ros.app.import_video.lens import METADATA_FOV_SIGMA, metadata_fov
+from hmt_ros.app.progress import notify_user, say
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
 from hmt_ros.app.report.command import ReportOptions, write_report
@@ -103,7 +103,7 @@ def _parser() -> CommandParser:
 def _track(arguments: argparse.Namespace) -> int:
     folder, quiet = arguments.output, arguments.quiet
     folder = folder or Path(f'{arguments.source.absolute().stem}_tracked')
-    tell = partial(tell_user, 'track-video')
+    notify = partial(notify_user, 'track-video')
     overwrite, stature = arguments.overwrite, arguments.stature
 
     def done(text: object) -> None:
@@ -137,16 +137,16 @@ def _track(arguments: argparse.Namespace) -> int:
             '"python -m hmt_ros install-detector", or give --keypoints or --background'
         )
     for note in notes:
-        tell(note)
+        notify(note)
     video, start = folder / VIDEO, folder / SUBJECT
-    imported = import_video(argparse.Namespace(**{**vars(arguments), 'output': video}), tell)
+    imported = import_video(argparse.Namespace(**{**vars(arguments), 'output': video}), notify)
     done(f'{video}: {imported}')
     subject = arguments.subject
     if stature is not None:
         try:
             seen = find_start(video, load_body('human37'))
         except ValueError as error:
-            tell(f'{error}: --stature is not used')
+            notify(f'{error}: --stature is not used')
         else:
             subject = start
             with new_file(start) as file:
@@ -161,7 +161,7 @@ def _track(arguments: argparse.Namespace) -> int:
         people=several,
         settings=[*settings, *_of_gravity(arguments), *arguments.settings],
     )
-    replayed = replay_bag(video, folder / TRACKED, options, tell)
+    replayed = replay_bag(video, folder / TRACKED, options, notify)
     done(f'{folder / TRACKED}: {replayed}')
     _, written = write_report(
         ReportOptions(
@@ -190,8 +190,8 @@ def _assumed(arguments: argparse.Namespace) -> tuple[list[str], list[str]]:
         )
     if (arguments.camera, arguments.fov, arguments.vertical_fov) == (None, None, None):
         first = next(iter(open_source(source, arguments.fps).frames(Selection())), None)
-        told = None if source.is_dir() else told_fov(source)
-        fov, sigma = (USUAL_FOV, USUAL_SIGMA) if told is None else (told, TOLD_SIGMA)
+        told = None if source.is_dir() else metadata_fov(source)
+        fov, sigma = (USUAL_FOV, USUAL_SIGMA) if told is None else (told, METADATA_FOV_SIGMA)
         height, width = (0, 1) if first is None else first.image.shape[:2]
         arguments.fov, arguments.vertical_fov = (fov, None) if width >= height else (None, fov)
         settings.append(f'focal_length_sigma={sigma}')

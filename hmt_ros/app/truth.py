@@ -18,9 +18,9 @@ from msg_tools.files.budget import Budget
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, MixtureKind, pose_mixture_of
 
 FIELDS = ('stamps', 'joint_names', 'joints')
-_LARGEST = 2**28  # maximum size of the arrays, bytes
-_RECORDS = 4  # cost of a frame in the budget, records
-_FLOOR = ('gravity', 'camera_height')
+_MAX_BYTES = 2**28  # maximum size of the arrays, bytes
+_RECORDS_PER_FRAME = 4  # cost of a frame in the budget, records
+_FLOOR_FIELDS = ('gravity', 'camera_height')
 
 
 def read_truth(path: Path) -> Truth:
@@ -61,12 +61,12 @@ def recorded_truth(path: Path) -> Truth | None:
 
 def _from_arrays(path: Path) -> Truth:
     try:
-        content = read_archive(path, _LARGEST)
+        content = read_archive(path, _MAX_BYTES)
         missing = [name for name in FIELDS if name not in content]
         if missing:
             raise ValueError(f'it has no {missing}; it has {sorted(content)}')
         stamps, names, joints = (content[name] for name in FIELDS)
-        Budget(path.stat().st_size).spend(records=_RECORDS * stamps.size)
+        Budget(path.stat().st_size).spend(records=_RECORDS_PER_FRAME * stamps.size)
     except OSError as error:
         raise ValueError(f'{path} can not be read ({error.strerror or error})') from error
     except ValueError as error:
@@ -85,7 +85,7 @@ def _from_arrays(path: Path) -> Truth:
 
 def _ground(path: Path, content: Mapping[str, Array], stamps: Array) -> dict[int, TrueGround]:
     """The true floor in a file; empty if gravity or height of the camera are missing."""
-    if not set(_FLOOR) <= content.keys():
+    if not set(_FLOOR_FIELDS) <= content.keys():
         return {}
     shapes = {'gravity': (3,), 'camera_height': (), 'contact': (2,)}
     shapes |= {'camera_position': (3,), 'camera_quaternion': (4,)}

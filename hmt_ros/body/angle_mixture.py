@@ -33,10 +33,10 @@ from hmt_ros.inference.linear_algebra import inverse_triangular, product, solve
 from hmt_ros.inference.mixture import GaussianMixture
 
 KIND = 'pose_prior'
-MOST_COMPONENTS = 1000
+MAX_COMPONENTS = 1000
 # Maximum number of steps of the ascent to the highest density; step size at which it ends, rad.
-CLIMB, ARRIVED = 1000, 1e-7
-SAME = 1e-4  # maximum difference between equal rest rotations in single precision
+MAX_ASCENT_STEPS, ASCENT_TOLERANCE = 1000, 1e-7
+ROTATION_TOLERANCE = 1e-4  # maximum difference between equal rest rotations in single precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +68,8 @@ class AngleMixture:
         require(different and rotation.all(), 'wanted different angles')
         own, total = self.components, float(self.components.weights.sum())
         require(
-            own.dimension == len(self.dofs) and 2 <= len(own) <= MOST_COMPONENTS,
-            f'{len(own)} components over {own.dimension} angles, wanted 2 to {MOST_COMPONENTS} '
+            own.dimension == len(self.dofs) and 2 <= len(own) <= MAX_COMPONENTS,
+            f'{len(own)} components over {own.dimension} angles, wanted 2 to {MAX_COMPONENTS} '
             f'over {len(self.dofs)}',
         )
         right = abs(total - 1.0) < 1e-3 and (own.weights > 0).all()
@@ -112,7 +112,7 @@ class AngleMixture:
         precisions = self.precisions.reshape(len(whole), n * n)
         pulled = product(self.precisions, whole.means[..., None])[..., 0]
         points = whole.means.copy()
-        for _ in range(CLIMB):
+        for _ in range(MAX_ASCENT_STEPS):
             log = whole.component_log_densities(points) + elementary.log(whole.weights)
             shares = elementary.exp(log - log.max(axis=1, keepdims=True))
             shares /= shares.sum(1, keepdims=True)
@@ -120,7 +120,7 @@ class AngleMixture:
             curvature = product(shares, precisions).reshape(-1, n, n)
             moved = solve(curvature, product(shares, pulled)[..., None])[..., 0]
             step, points = float(np.abs(moved - points).max()), moved
-            if step < ARRIVED:
+            if step < ASCENT_TOLERANCE:
                 break
         return float(whole.log_density(points).max())
 
@@ -148,7 +148,7 @@ class AngleMixture:
                 skeleton differs.
         """
         parameters, card = parameters_of(arrays), parameters_of(arrays, 'card')
-        same = np.allclose(arrays['mounts'], skeleton.mounts, atol=SAME)
+        same = np.allclose(arrays['mounts'], skeleton.mounts, atol=ROTATION_TOLERANCE)
         same = same and parameters['body'] == skeleton.name
         require(same, f'it is for another body than {skeleton.name}, or other frames at rest')
         dofs, means = tuple(map(str, parameters['dofs'])), arrays['means']
@@ -194,7 +194,7 @@ def _same_angles(first: Skeleton, second: Skeleton) -> bool:
         and np.array_equal(first.dof_axes, second.dof_axes)
         and first.mounts.shape == second.mounts.shape
         # The root may have another level.
-        and np.allclose(first.mounts[1:], second.mounts[1:], atol=SAME)
+        and np.allclose(first.mounts[1:], second.mounts[1:], atol=ROTATION_TOLERANCE)
     )
 
 

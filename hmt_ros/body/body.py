@@ -31,11 +31,11 @@ from hmt_ros.inference.logistic import probability_of
 # Columns of the growth, which is the difference of a part of the flesh from the model file: log
 # factors on the x and y radii, additional extent beyond the start and the end of its segment, m,
 # and shift along the y axis, m.
-GROWTH = ('width', 'depth', 'start', 'end', 'shift')
+GROWTH_COLUMNS = ('width', 'depth', 'start', 'end', 'shift')
 # Angles of a root that can be levelled.
 ROOT_ANGLES = ('root_z', 'root_y', 'root_x')
 # Minimum half height of a part, m.
-LEAST_HEIGHT = 5e-3
+MIN_HEIGHT = 5e-3
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class PartShape:
             span = float(lengths[self.length])
             rz = 0.5 * (span + start + end)
             cz -= 0.5 * (span + end - start)
-        rz = max(rz, LEAST_HEIGHT)
+        rz = max(rz, MIN_HEIGHT)
         return Superquadric(
             self.segment, (cx, cy + shift, cz), (rx, ry, rz), self.exponents, self.taper, self.bend
         )
@@ -112,7 +112,7 @@ class Body:
         symmetries: symmetries by map; see `Symmetry`.
         joint_errors: (J,) standard deviation of the constant error of each joint's coordinates
             relative to the pelvis, m, because people's joints differ from the model's.
-        growth: (B, 5) difference of each part from the model's; see `GROWTH`.
+        growth: (B, 5) difference of each part from the model's; see `GROWTH_COLUMNS`.
         level: (3, 3) rotation from the reference axes of the root's angles to the axes of the
             camera; see `levelled`.
     """
@@ -128,11 +128,11 @@ class Body:
     default_lengths: Array
     symmetries: Mapping[str, Symmetry]
     joint_errors: Array
-    growth: Array = field(default_factory=lambda: np.zeros((0, len(GROWTH))))
+    growth: Array = field(default_factory=lambda: np.zeros((0, len(GROWTH_COLUMNS))))
     level: Array = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        wanted = (len(self.shapes), len(GROWTH))
+        wanted = (len(self.shapes), len(GROWTH_COLUMNS))
         growth = np.array(self.growth, dtype=np.float64) if len(self.growth) else np.zeros(wanted)
         if growth.shape != wanted or not np.isfinite(growth).all():
             raise ValueError(
@@ -295,7 +295,7 @@ class Body:
         return replace(self, skeleton=skeleton, length_covariance=covariance)
 
     def with_growth(self, growth: ArrayLike) -> Body:
-        """Return the same body with another growth (B, 5) of the parts; see `GROWTH`.
+        """Return the same body with another growth (B, 5) of the parts; see `GROWTH_COLUMNS`.
 
         Raises:
             ValueError: the shape is wrong, or a number is not finite.

@@ -33,22 +33,22 @@ AXES.setflags(write=False)
 IMAGE_UP = np.array([0.0, -1.0, 0.0])
 IMAGE_UP.setflags(write=False)
 # Range of distances with 95 % of visible people, m, for a lens with the usual angle of view, rad.
-NEAREST_PERSON, FARTHEST_PERSON, USUAL_LENS = 0.4, 15.0, np.radians(60.0)
+NEAR_PERSON_DISTANCE, FAR_PERSON_DISTANCE, USUAL_ANGLE_OF_VIEW = 0.4, 15.0, np.radians(60.0)
 
-NEAR = 0.01  # minimum depth of a point that has a pixel, m
+MIN_DEPTH = 0.01  # minimum depth of a point that has a pixel, m
 # Minimum component of the unit vertical across the optical axis for which the roll is defined.
-STEEP = 0.1
+MIN_ROLL_COMPONENT = 0.1
 # Tangents of the angles at which a distortion is checked; maximum growth of the magnification
 # outwards. Calibrations of real lenses reach 2.5, at the corners of wide images.
 _TURNS = 0.499 * np.pi * np.linspace(0.0, 1.0, 300) ** 2
-CHECKED = elementary.sin(_TURNS) / elementary.cos(_TURNS)
-LARGEST_RISE = 4.0
+CHECKED_RADII = elementary.sin(_TURNS) / elementary.cos(_TURNS)
+MAX_RISE = 4.0
 # Fraction of the way from the principal point to a corner up to which a distortion must not fold.
 # It covers the ends of the longer side; polynomials of real calibrations may fold farther out.
-LEAST_UNFOLDED = 0.8
+MIN_UNFOLDED_FRACTION = 0.8
 
 # Models of distortion in compiled code.
-LENSES = {'plumb_bob': 0, 'rational_polynomial': 0, 'equidistant': 1}
+LENS_CODES = {'plumb_bob': 0, 'rational_polynomial': 0, 'equidistant': 1}
 
 
 class Lens(NamedTuple):
@@ -61,7 +61,7 @@ class Lens(NamedTuple):
     centre: tuple[float, float]
     model: int
     coefficients: tuple[float, ...]
-    near: float = NEAR
+    near: float = MIN_DEPTH
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class Camera:
         if bends and not coefficients:
             coefficients = (0.0,) * max(counts)
         object.__setattr__(self, 'distortion', coefficients if bends else ())
-        if bends and (share := unfolded_share(self)) < LEAST_UNFOLDED:
+        if bends and (share := unfolded_share(self)) < MIN_UNFOLDED_FRACTION:
             raise ValueError(
                 f'the distortion {self.distortion_model} of {self.distortion} folds or '
                 f'overstretches the image of {self.width}x{self.height} pixels from {share:.0%} of '
@@ -149,7 +149,7 @@ class Camera:
     def lens(self) -> Lens:
         """The camera for compiled code."""
         coefficients = (*map(float, self.distortion), *(0.0,) * 8)[:8]
-        model = LENSES[self.distortion_model] if self.distortion else -1
+        model = LENS_CODES[self.distortion_model] if self.distortion else -1
         focal, centre = (float(self.fx), float(self.fy)), (float(self.cx), float(self.cy))
         return Lens(focal, centre, model, coefficients)
 
@@ -177,7 +177,7 @@ class Camera:
         0.01 m give NaN.
         """
         x, y, z = points
-        z = np.where(z > NEAR, z, np.nan)
+        z = np.where(z > MIN_DEPTH, z, np.nan)
         a, b = x / z, y / z
         distorted, inner = self.distort(a, b)
         lens = ((self.fx, self.cx), (self.fy, self.cy))
@@ -193,7 +193,7 @@ class Camera:
 
     def magnification(self, depth: float) -> float:
         """Pixels per metre across the optical axis at a depth, m."""
-        return float(np.sqrt(self.fx * self.fy)) / max(depth, NEAR)
+        return float(np.sqrt(self.fx * self.fy)) / max(depth, MIN_DEPTH)
 
     def rays(self, pixels: ArrayLike) -> Array:
         """Unit rays (..., 3) through pixels (..., 2).
@@ -255,19 +255,19 @@ def unfolded_share(camera: Camera) -> float:
     """Return the fraction of the way to the corners without a fold of the distortion, 0 to 1.
 
     From the principal point to each corner the distorted radius must increase with the ideal one,
-    and its slope must stay below `LARGEST_RISE` times the smallest slope nearer the centre.
+    and its slope must stay below `MAX_RISE` times the smallest slope nearer the centre.
     """
     x, y = (np.array([-0.5, n - 0.5]) for n in (camera.width, camera.height))
     a, b = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
     corners = elementary.hypot(a, b).reshape(-1, 1).clip(min=1e-9)
-    ideal = CHECKED * np.stack([a, b]).reshape(2, -1, 1) / corners
+    ideal = CHECKED_RADII * np.stack([a, b]).reshape(2, -1, 1) / corners
     with np.errstate(all='ignore'):  # a rational model has poles outside the image
         radius = elementary.hypot(*camera.distort(*ideal)[0])
-        slope = np.diff(radius) / np.diff(CHECKED)
+        slope = np.diff(radius) / np.diff(CHECKED_RADII)
     # A fold outside the image may map back into it, but affects no pixel.
     reached = np.maximum.accumulate(radius, axis=1)[:, :-1]
     # The slope at the principal point is 1.
-    steepest = LARGEST_RISE * np.minimum.accumulate(slope, axis=1).clip(max=1.0)
+    steepest = MAX_RISE * np.minimum.accumulate(slope, axis=1).clip(max=1.0)
     folded = (reached < corners) & ((slope <= 0) | (slope > steepest))
     return float(np.where(folded, reached / corners, 1.0).min())
 
@@ -277,11 +277,13 @@ def roll(ups: ArrayLike) -> Array:
 
     Args:
         ups: (..., 3) vectors against gravity, camera frame. Vectors nearly along the optical axis
-            (`STEEP`), and zeros, give no roll.
+            (`MIN_ROLL_COMPONENT`), and zeros, give no roll.
     """
     x, y, _ = np.moveaxis(np.asarray(ups, dtype=np.float64), -1, 0)
     length = elementary.hypot(x, y)
-    x, y = np.where(length > STEEP, (x, y), np.reshape((0.0, -1.0), (2, *(1,) * np.ndim(length))))
+    x, y = np.where(
+        length > MIN_ROLL_COMPONENT, (x, y), np.reshape((0.0, -1.0), (2, *(1,) * np.ndim(length)))
+    )
     sine, cosine = np.stack([x, -y]) / elementary.hypot(x, y)
     result = np.zeros((*np.shape(x), 3, 3))
     result[..., 0, 0] = result[..., 1, 1] = cosine
@@ -314,8 +316,8 @@ def log_prior_of_distance(camera: Camera, distance: float) -> float:
 
     The prior is log-normal, and wide enough to exclude no distance.
     """
-    lens = camera.fx / (0.5 * camera.width / tangent(0.5 * USUAL_LENS))
-    middle = math.sqrt(NEAREST_PERSON * FARTHEST_PERSON)
+    lens = camera.fx / (0.5 * camera.width / tangent(0.5 * USUAL_ANGLE_OF_VIEW))
+    middle = math.sqrt(NEAR_PERSON_DISTANCE * FAR_PERSON_DISTANCE)
     # The range spans two standard deviations on either side.
-    sigma = float(elementary.log(FARTHEST_PERSON / NEAREST_PERSON)) / 4.0
+    sigma = float(elementary.log(FAR_PERSON_DISTANCE / NEAR_PERSON_DISTANCE)) / 4.0
     return -0.5 * (float(elementary.log(max(distance, 1e-3) / (lens * middle))) / sigma) ** 2

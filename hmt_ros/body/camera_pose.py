@@ -13,7 +13,7 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import determinant, length, product
 
 # Maximum deviation of an entry of R R' from the identity for a valid rotation R.
-NOT_ORTHOGONAL = 1e-3
+ROTATION_TOLERANCE = 1e-3
 # Default distance of people and of the scene, m.
 USUAL_DISTANCE = 3.0
 
@@ -43,7 +43,7 @@ class CameraPose(NamedTuple):
             )
         if (
             turn.shape != AXES.shape
-            or not np.abs(product(turn, turn.T) - AXES).max() < NOT_ORTHOGONAL
+            or not np.abs(product(turn, turn.T) - AXES).max() < ROTATION_TOLERANCE
             or determinant(turn) < 0
         ):
             raise ValueError(

@@ -348,7 +348,7 @@ def _down_and_ahead(skeleton: Skeleton, ankle: int, toe: int, carrier: int) -> t
 
 
 # Mass fraction of each segment, and its centre as a fraction of the way from start to end.
-SHARES = {
+MASS_FRACTIONS = {
     'pelvis': (0.142, 0.0),
     'trunk': (0.355, 0.37),
     'head': (0.081, 1.0),
@@ -360,7 +360,7 @@ SHARES = {
     'foot': (0.0145, 0.5),
 }
 # Minimum total mass fraction of the known segments of a body.
-LEAST_SHARE = 0.8
+MIN_MASS_FRACTION = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,16 +388,16 @@ class Masses:
 
 @lru_cache(maxsize=16)
 def masses(skeleton: Skeleton) -> Masses:
-    """Return the masses of a skeleton with segment names as in `SHARES`, else unknown masses."""
+    """Return the masses of a skeleton; unknown masses if `MASS_FRACTIONS` lacks its segments."""
     count = len(skeleton.parents)
     shares, centres = np.zeros(count), np.zeros((count, 3))
     for s, name in enumerate(skeleton.segment_names):
         bare = name.split('_', 1)[1] if other_side(name) != name else name
-        if bare not in SHARES:
+        if bare not in MASS_FRACTIONS:
             continue
-        shares[s], way = SHARES[bare]
+        shares[s], way = MASS_FRACTIONS[bare]
         centres[s] = way * _end(skeleton, s)
-    if shares.sum() < LEAST_SHARE:
+    if shares.sum() < MIN_MASS_FRACTION:
         return Masses(np.zeros(count), centres)
     return Masses(shares / shares.sum(), centres)
 

@@ -33,11 +33,11 @@ from hmt_ros.inference.mixture import GaussianMixture
 # Error of the body model in its tails, m.
 MARGIN = 0.05
 # Radius of a bone of a body without flesh, m.
-BARE = 0.07
+BARE_BONE_RADIUS = 0.07
 # Distance of neighbouring capsules relative to their radius.
-SPACING = 1.2
+CAPSULE_SPACING = 1.2
 # Spread relative to the radius below which a capsule is widened instead of repeated.
-LITTLE = 0.15
+MAX_WIDENING = 0.15
 # Cosines and sines of angles around an axis.
 _ANGLES = np.arange(8) * (np.pi / 4)
 _RING = np.stack([elementary.cos(_ANGLES), elementary.sin(_ANGLES)])
@@ -80,7 +80,7 @@ class Capsules:
         """Whether each of points (P, 3) is in any capsule, (P,)."""
         return np.asarray((self.depths(points) >= 0.0).any(1))
 
-    def without_held(self) -> Capsules:
+    def without_contained(self) -> Capsules:
         """Drop capsules inside the union of larger ones, tested at a few surface points."""
         order = np.argsort(-self._sizes, kind='stable')
         some = self[order]
@@ -140,9 +140,9 @@ def keep_out_capsules(body: Body, mixture: GaussianMixture, probability: float =
     radius = radii + MARGIN + wide * across
     beyond = wide * np.maximum(along - across, 0.0)
     # A small spread widens the capsule and needs no second one.
-    little = beyond < LITTLE * radius
+    little = beyond < MAX_WIDENING * radius
     radius, beyond = np.where(little, radius + beyond, radius), np.where(little, 0.0, beyond)
-    steps = np.ceil(beyond / (0.5 * SPACING * radius)).astype(np.intp)
+    steps = np.ceil(beyond / (0.5 * CAPSULE_SPACING * radius)).astype(np.intp)
     # Each part is repeated at steps + 1 places, from one end of its spread to the other.
     counts = steps.reshape(-1) + 1
     part = np.repeat(np.arange(len(counts)), counts)
@@ -150,7 +150,7 @@ def keep_out_capsules(body: Body, mixture: GaussianMixture, probability: float =
     far, last = beyond.reshape(-1)[part], steps.reshape(-1)[part]
     shifts = np.where(number < last, number * (2.0 * far / np.maximum(last, 1)) - far, far)
     at = places.reshape(-1, 2, 3)[part] + shifts[:, None, None] * deep.reshape(-1, 2, 3)[part]
-    return Capsules(at[:, 0], at[:, 1], radius.reshape(-1)[part]).without_held()
+    return Capsules(at[:, 0], at[:, 1], radius.reshape(-1)[part]).without_contained()
 
 
 @lru_cache(maxsize=16)
@@ -172,7 +172,7 @@ def _parts(body: Body) -> tuple[Index, Array, Array]:
         for joints in skeleton.bones:
             segments += [int(skeleton.joint_segments[joint]) for joint in joints]
             ends += [skeleton.joint_offsets[joint] for joint in joints]
-            radii.append(BARE)
+            radii.append(BARE_BONE_RADIUS)
     return np.array(segments, dtype=np.intp), np.array(ends), np.array(radii)
 
 

@@ -41,21 +41,21 @@ Arrays = dict[str, NDArray[Any]]
 
 # Maximum sizes of a file: numbers and bytes of all arrays, characters of a text. A neighbour model
 # with 80,000 silhouettes and a model for rule (1) has 19 million numbers.
-MOST_VALUES, LONGEST_TEXT = 20_000_000, 2**20
-LARGEST_FILE = 8 * MOST_VALUES
+MAX_VALUES, MAX_TEXT = 20_000_000, 2**20
+MAX_FILE_BYTES = 8 * MAX_VALUES
 # Maximum number of inputs or outputs of a model; a descriptor has a few hundred, a pose forty.
-MOST_NUMBERS = 10_000
+MAX_INPUTS = 10_000
 # Ranges of positive numbers and of variances, and maximum ratio of variances. They keep products of
 # a few numbers finite, and small variances significant in sums of covariances.
-LEAST, LARGEST = 1e-15, 1e30
-LEAST_VARIANCE, LARGEST_VARIANCE, LARGEST_RATIO = 1e-25, 1e12, 1e13
+MIN_POSITIVE, MAX_POSITIVE = 1e-15, 1e30
+MIN_VARIANCE, MAX_VARIANCE, MAX_RATIO = 1e-25, 1e12, 1e13
 # Minimum eigenvalue of a correlation matrix for its Cholesky factor.
-LEAST_EIGENVALUE = 1e-13
+MIN_EIGENVALUE = 1e-13
 # Maximum difference of an answer from the stored one, in standard deviations and in nats per
 # variable. Networks compute in single precision, which differs by up to 1e-5 between machines.
 TOLERANCE = 1e-3
 # Exceptions that wrong arrays can cause.
-FAULTS = (
+ARRAY_ERRORS = (
     OSError,
     LookupError,
     TypeError,
@@ -67,10 +67,10 @@ FAULTS = (
     np.linalg.LinAlgError,
 )
 
-_HEADER = ('format', 'version', 'kind')
-_TEXTS = ('format', 'kind', 'parameters', 'card', 'checksum')
-_WHOLE_NUMBERS = ('version', 'shape', 'active', 'n_experts')
-_INPUT, _ANSWER = 'example/input', 'example/answer'
+_HEADER_FIELDS = ('format', 'version', 'kind')
+_TEXT_FIELDS = ('format', 'kind', 'parameters', 'card', 'checksum')
+_INTEGER_FIELDS = ('version', 'shape', 'active', 'n_experts')
+_EXAMPLE_INPUT, _EXAMPLE_OUTPUT = 'example/input', 'example/answer'
 
 
 class LearnedModel(Protocol):
@@ -95,7 +95,7 @@ def named_faults(where: str) -> Iterator[None]:
     try:
         with np.errstate(all='ignore'):
             yield
-    except FAULTS as fault:
+    except ARRAY_ERRORS as fault:
         text = error_line(fault)[:150] if isinstance(fault, ValueError) else type(fault).__name__
         raise ValueError(
             f'{where}: not a model file that can be used ({text}); train or learn it again'
@@ -124,7 +124,7 @@ def header(kind: str, parameters: Mapping[str, Any]) -> Arrays:
 
 def check_header(arrays: Mapping[str, NDArray[Any]], kind: str) -> None:
     """Raise ValueError unless the arrays have the header of a model of the given kind."""
-    single = [name for name in _HEADER if name in arrays and not arrays[name].ndim]
+    single = [name for name in _HEADER_FIELDS if name in arrays and not arrays[name].ndim]
     found = {name: str(arrays[name]) for name in single}
     require(found.get('format') == FORMAT, 'it is none of hmt_ros')
     require(found.get('version') == str(VERSION), 'it is of another version')
@@ -155,12 +155,12 @@ def body_of(parameters: Mapping[str, Any]) -> Body:
 def check_positive(name: str, values: Any) -> None:
     """Raise ValueError if numbers are not positive or are out of range."""
     require(
-        np.min(values) >= LEAST and np.max(values) <= LARGEST,
-        f'{name} must be positive, from {LEAST:g} to {LARGEST:g}',
+        np.min(values) >= MIN_POSITIVE and np.max(values) <= MAX_POSITIVE,
+        f'{name} must be positive, from {MIN_POSITIVE:g} to {MAX_POSITIVE:g}',
     )
 
 
-def check_covariances(name: str, values: Array, slack: float = -LEAST_EIGENVALUE) -> None:
+def check_covariances(name: str, values: Array, slack: float = -MIN_EIGENVALUE) -> None:
     """Checks covariances (..., D, D).
 
     Args:
@@ -173,8 +173,8 @@ def check_covariances(name: str, values: Array, slack: float = -LEAST_EIGENVALUE
     variances = np.diagonal(values, axis1=-2, axis2=-1)
     least, largest = variances.min(initial=1.0), variances.max(initial=1.0)
     require(
-        least >= LEAST_VARIANCE and largest <= min(LARGEST_VARIANCE, LARGEST_RATIO * least),
-        f'{name} has variances out of {LEAST_VARIANCE:g} to {LARGEST_VARIANCE:g}, or apart',
+        least >= MIN_VARIANCE and largest <= min(MAX_VARIANCE, MAX_RATIO * least),
+        f'{name} has variances out of {MIN_VARIANCE:g} to {MAX_VARIANCE:g}, or apart',
     )
     deviations = np.sqrt(variances)
     correlations = values / deviations[..., None] / deviations[..., None, :]
@@ -206,10 +206,10 @@ def write_model(
     """
     arrays = model.to_arrays()
     whole = {**card, 'numbers': sum(values.size for values in arrays.values())}
-    arrays |= {'card': np.array(json.dumps(whole, sort_keys=True)), _INPUT: example}
+    arrays |= {'card': np.array(json.dumps(whole, sort_keys=True)), _EXAMPLE_INPUT: example}
     with named_faults(str(path)):
         # The model read back, so that its answer has the precision of the file.
-        arrays[_ANSWER] = _answer(read(arrays), arrays)
+        arrays[_EXAMPLE_OUTPUT] = _answer(read(arrays), arrays)
         arrays['checksum'] = np.array(checksum(arrays))
         checked_model(arrays, read)
     return write_arrays(path, arrays)
@@ -228,7 +228,7 @@ def read_model(path: str | Path, kind: str, read: Callable[[Arrays], Model]) -> 
     if not Path(path).is_file():
         raise FileNotFoundError(f'{path}: no such model file; train or learn one')
     with named_faults(str(path)):
-        arrays = read_archive(path, LARGEST_FILE)
+        arrays = read_archive(path, MAX_FILE_BYTES)
         check_header(arrays, kind)
         return checked_model(arrays, read)
 
@@ -237,7 +237,7 @@ def checked_model(arrays: Arrays, read: Callable[[Arrays], Model]) -> Model:
     """Build the model from the arrays of a complete file, and check it.
 
     Raises:
-        Exception: the arrays are damaged or wrong; one of `FAULTS`.
+        Exception: the arrays are damaged or wrong; one of `ARRAY_ERRORS`.
     """
     own = str(arrays.get('checksum'))
     require(own == checksum(arrays), 'it is damaged, its checksum is another one: copy it again')
@@ -245,11 +245,14 @@ def checked_model(arrays: Arrays, read: Callable[[Arrays], Model]) -> Model:
     model = read(arrays)
     numbers = [
         {name: (x.dtype, x.shape) for name, x in some.items() if x.dtype.kind != 'U'}
-        for some in (arrays, model.to_arrays() | {x: arrays[x] for x in (_INPUT, _ANSWER)})
+        for some in (
+            arrays,
+            model.to_arrays() | {x: arrays[x] for x in (_EXAMPLE_INPUT, _EXAMPLE_OUTPUT)},
+        )
     ]
     require(numbers[0] == numbers[1], 'an array has another name, type or shape than usual')
     parameters_of(arrays, 'card')
-    answer, stored = _answer(model, arrays), arrays[_ANSWER]
+    answer, stored = _answer(model, arrays), arrays[_EXAMPLE_OUTPUT]
     size = len(answer) // 2
     allowed = TOLERANCE * np.r_[answer[size:-1], answer[size:-1], size]
     same = answer.shape == stored.shape and (np.abs(answer - stored) <= allowed).all()
@@ -269,7 +272,7 @@ def checksum(arrays: Mapping[str, NDArray[Any]]) -> str:
 
 def _answer(model: LearnedModel, arrays: Arrays) -> Array:
     """Return mean, deviations (D,) and log density at the mean of the answer to the example."""
-    found = model.answer(arrays[_INPUT])
+    found = model.answer(arrays[_EXAMPLE_INPUT])
     require(abs(found.weights.sum() - 1.0) < TOLERANCE, 'its weights do not sum to 1')
     check_covariances('its answer', found.covariances)
     mean, whole = found.mean(), found.covariance()
@@ -280,16 +283,18 @@ def _answer(model: LearnedModel, arrays: Arrays) -> Array:
 def _check_values(arrays: Arrays) -> None:
     """Raise ValueError for wrong types of arrays and for numbers that are out of range."""
     size = sum(values.size for values in arrays.values())
-    require(size <= MOST_VALUES, f'it has more than {MOST_VALUES} numbers')
+    require(size <= MAX_VALUES, f'it has more than {MAX_VALUES} numbers')
     for name, values in arrays.items():
         own, kind = name.rpartition('/')[2], values.dtype.kind
-        usual = 'U' if own in _TEXTS else 'i' if own in _WHOLE_NUMBERS else 'f'
+        usual = 'U' if own in _TEXT_FIELDS else 'i' if own in _INTEGER_FIELDS else 'f'
         require(kind == usual, 'an array has another type than usual')
         if kind == 'U':
-            require(values.nbytes <= 4 * LONGEST_TEXT, 'a text is too long')
+            require(values.nbytes <= 4 * MAX_TEXT, 'a text is too long')
         else:
             largest = float(np.abs(values).max(initial=0))
-            require(largest <= LARGEST, 'an array has values that are not finite, or too large')
+            require(
+                largest <= MAX_POSITIVE, 'an array has values that are not finite, or too large'
+            )
 
 
 def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> Path:

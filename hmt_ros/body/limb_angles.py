@@ -27,12 +27,12 @@ SIDES = ('left', 'right')
 ARM = ('shoulder', 'elbow', 'wrist', 'hand')
 LEG = ('hip', 'knee', 'ankle', 'toe')
 # Weights of the cues for the twist of a limb; a hinge bent by a right angle has weight 1.
-FOOT = 0.3  # direction of the foot, for the leg
-AROUND, AROUND_TIME = 0.2, 0.2  # neighbouring frames; standard deviation of their time, s
-REST = 1e-3  # zero twist, the default
+FOOT_WEIGHT = 0.3  # direction of the foot, for the leg
+NEIGHBOUR_WEIGHT, AROUND_TIME = 0.2, 0.2  # neighbouring frames; standard deviation of their time, s
+ZERO_TWIST_WEIGHT = 1e-3  # zero twist, the default
 HIPS = ('pelvis', 'left_hip', 'right_hip')
 TRUNK_START = 'start of the trunk'
-FLEXIBLE = 0.05  # weight of neck and shoulders in the fit of the root, if the trunk can bend
+FLEXIBLE_WEIGHT = 0.05  # weight of neck and shoulders in the fit of the root, if the trunk can bend
 
 
 def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float | None) -> Array:
@@ -141,7 +141,7 @@ def _set_root(skeleton: Skeleton, place: Mapping[str, Array], poses: Array) -> A
     shifts = skeleton.dof_index(('root_tx', 'root_ty', 'root_tz'))
     flexible = bool(skeleton.moves[skeleton.chains['neck'][0]].sum() > 8)  # root and neck have 8
     names = ['pelvis', 'left_hip', 'right_hip', 'neck', 'left_shoulder', 'right_shoulder']
-    weights = np.array([1.0, 1.0, 1.0, *([FLEXIBLE if flexible else 1.0] * 3)])
+    weights = np.array([1.0, 1.0, 1.0, *([FLEXIBLE_WEIGHT if flexible else 1.0] * 3)])
     at_rest = forward(skeleton, np.zeros((1, skeleton.dimension))).joints()[..., 0]
     rest = at_rest[skeleton.joint_index(tuple(names))]
     seen = np.stack([place[n] for n in names], axis=1)
@@ -200,9 +200,9 @@ def _twist(
     toe = f'{side}_toe'
     if joint == 'ankle' and toe in place:
         forward_of_foot = _local(turn, place[toe] - place[next_end])
-        said += FOOT * np.stack([forward_of_foot[:, 1], -forward_of_foot[:, 0]], axis=1)
+        said += FOOT_WEIGHT * np.stack([forward_of_foot[:, 1], -forward_of_foot[:, 0]], axis=1)
     around = said if fps is None else _smoothed(said, AROUND_TIME * fps)
-    said = said + AROUND * around + [REST, 0.0]
+    said = said + NEIGHBOUR_WEIGHT * around + [ZERO_TWIST_WEIGHT, 0.0]
     twist: Array = elementary.arctan2(said[:, 1], said[:, 0])
     return twist
 

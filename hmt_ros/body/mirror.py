@@ -29,13 +29,13 @@ from hmt_ros.inference.mixture import GaussianMixture
 arctan2 = elementary.arctan2
 
 # Maximum sine of the angle between a person's front and the image plane in a side view.
-SIDEWAYS = 0.12
+MAX_SIDEWAYS_SINE = 0.12
 # Axes of the root's rotations, in the order in which they act.
 ROOT_AXES = 'zyx'
 TURN = 2.0 * np.pi
 # Ratio of root angles to their limits below which they count as far from limits and poles.
-CLEAR = 0.85
-QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+CLEARANCE_RATIO = 0.85
+QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def mirror(body: Body, poses: ArrayLike) -> Array:
@@ -170,12 +170,12 @@ def clear_level(body: Body, pose: Array) -> Array:
 
     It is the level of the body if that suffices, else this level rotated by quarter turns.
     """
-    best, least = body.level, CLEAR
+    best, least = body.level, CLEARANCE_RATIO
     if not {*ROOT_ANGLES} <= {*body.dof_names}:
         return best
     limits = root_rotation_dofs(body.skeleton)[1:]
     upright = np.eye(3)
-    for turn in (upright, QUARTER, product(QUARTER, QUARTER), QUARTER.T):
+    for turn in (upright, QUARTER_TURN, product(QUARTER_TURN, QUARTER_TURN), QUARTER_TURN.T):
         level: Array = product(turn, body.level)
         angles = turned(body, pose[None], body.levelled(level))[0, limits]
         share = float(np.abs(angles / body.upper[limits]).max())
@@ -233,7 +233,7 @@ def faces_back(body: Body, joints: Array, reference: Array) -> Mask:
     """
     (neck,) = body.skeleton.joint_index(('neck',))
     result = np.empty(len(joints), dtype=np.bool_)
-    face_back(trunk_of(body), joints, reference, neck, SIDEWAYS, result)
+    face_back(trunk_of(body), joints, reference, neck, MAX_SIDEWAYS_SINE, result)
     return result
 
 

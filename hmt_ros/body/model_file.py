@@ -40,9 +40,9 @@ AXES = {
 }
 MIRROR = np.array([-1.0, 1.0, 1.0])
 DIFFUSION = (0.25, 1.4)  # default of a root, m and rad after one second
-FARTHEST = 1000.0  # upper bound of lengths, m
-MOST_RINGS = 100
-LARGEST_FILE = 250_000  # maximum size, bytes; a body is a few kB
+MAX_COORDINATE = 1000.0  # upper bound of lengths, m
+MAX_RINGS = 100
+MAX_FILE_BYTES = 250_000  # maximum size, bytes; a body is a few kB
 
 
 def model_names() -> list[str]:
@@ -113,7 +113,7 @@ def _read(source: str | Path) -> dict[str, Any]:
         raise FileNotFoundError(
             f'no body {str(source)!r}: wanted one of {model_names()}, or a YAML file'
         )
-    return _whole(read_plain_yaml(path, LARGEST_FILE))
+    return _whole(read_plain_yaml(path, MAX_FILE_BYTES))
 
 
 @cache
@@ -242,9 +242,9 @@ def _build(content: dict[str, Any]) -> Body:
     length_names = tuple(content['lengths'])
     lengths = np.array([float(v[0]) for v in content['lengths'].values()])
     relative = np.array([float(v[1]) for v in content['lengths'].values()])
-    if not (np.abs([lengths, relative]) < FARTHEST).all():
+    if not (np.abs([lengths, relative]) < MAX_COORDINATE).all():
         raise ValueError(
-            f'lengths must be finite and below {FARTHEST:g} m, saw {content["lengths"]}'
+            f'lengths must be finite and below {MAX_COORDINATE:g} m, saw {content["lengths"]}'
         )
     stature_spread = float(content.get('stature_spread', STATURE_SPREAD))
     for name in content['stature']:
@@ -381,8 +381,8 @@ def _shape(
     size = _named(flesh['size'], length_names, 'flesh: size') if 'size' in flesh else length
     radii = tuple(float(x) for x in flesh['radii'])
     rings = int(flesh.get('rings', 5))
-    if not 1 <= rings <= MOST_RINGS:
-        raise ValueError(f'rings must be 1 to {MOST_RINGS}, saw {rings}')
+    if not 1 <= rings <= MAX_RINGS:
+        raise ValueError(f'rings must be 1 to {MAX_RINGS}, saw {rings}')
     if len(radii) not in (2, 3) or not all(r > 0 for r in radii):
         raise ValueError(f'radii must be two or three positive numbers, saw {list(radii)}')
     spans = len(radii) == 2
@@ -426,7 +426,7 @@ def length_covariance(
         ValueError: a spread is negative or not finite.
     """
     typical, own = (np.asarray(x, dtype=np.float64) for x in (lengths, proportions))
-    if not 0.0 <= stature < FARTHEST:
+    if not 0.0 <= stature < MAX_COORDINATE:
         raise ValueError(f'stature_spread must be a number of at least 0, saw {stature}')
     if not (np.isfinite(own).all() and (own >= 0).all()):
         raise ValueError(f'spreads of lengths must be numbers of at least 0, saw {own.tolist()}')
@@ -435,7 +435,7 @@ def length_covariance(
     return result
 
 
-def held(covariance: Array, functions: ArrayLike, sigma: ArrayLike) -> Array:
+def conditioned_covariance(covariance: Array, functions: ArrayLike, sigma: ArrayLike) -> Array:
     """Condition the covariance (L, L) of lengths on known linear functions of them.
 
     Args:

@@ -22,7 +22,7 @@ from hmt_ros.inference.linear_algebra import product
 
 # From the optical frame of a level camera, y down and z forward, to y up and z towards the camera.
 CAMERA_TO_ROOM = np.diag([1.0, -1.0, -1.0])
-MOST_FRAMES = 1_000_000
+MAX_FRAMES = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +95,8 @@ class MovingSkeleton:
             ValueError: the result would have too many times.
         """
         count = 1 + int((self.times[-1] - self.times[0]) * rate + 0.01)
-        if count > MOST_FRAMES:
-            raise ValueError(f'{count} frames, wanted {MOST_FRAMES} at most: a lower --fps')
+        if count > MAX_FRAMES:
+            raise ValueError(f'{count} frames, wanted {MAX_FRAMES} at most: a lower --fps')
         times = self.times[0] + np.arange(count) / rate
         inside = np.minimum(times, self.times[-1])
         rotations, places = self.rotations[[0] * count], self.places[[0] * count]

@@ -25,11 +25,11 @@ from hmt_ros.inference.mixture import GaussianMixture
 
 # Share of the mode's own prediction for a limb hidden for a long time, and time constant of the
 # decay from 1 to this share, s. Chosen on clips.
-SUPPOSED, FORGOTTEN = 0.5, 1.0
+PREDICTION_SHARE, FORGETTING_TIME = 0.5, 1.0
 # Minimum weight of a component, a posture of a mode, that is kept.
-LIGHTEST = 0.006
+MIN_WEIGHT = 0.006
 # Joints that stay fixed while the pelvis turns.
-TOP = ('neck', 'left_shoulder', 'right_shoulder')
+FIXED_JOINTS = ('neck', 'left_shoulder', 'right_shoulder')
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +72,10 @@ class Postures:
         if not differs[hidden].any():
             log_shares[:, 1:] = -np.inf
         shares = elementary.exp(log_shares - log_sum_exp(log_shares, axis=1)[:, None])
-        other = (1.0 - SUPPOSED) * -elementary.expm1(-unseen.max() / FORGOTTEN)
+        other = (1.0 - PREDICTION_SHARE) * -elementary.expm1(-unseen.max() / FORGETTING_TIME)
         shares = np.insert(other * shares, 0, 1.0 - other, axis=1)
         weights = modes.normalised().weights[:, None]
-        shares[(weights * shares < LIGHTEST) & (np.arange(shares.shape[1]) > 0)] = 0.0
+        shares[(weights * shares < MIN_WEIGHT) & (np.arange(shares.shape[1]) > 0)] = 0.0
         weights = weights * shares / shares.sum(1)[:, None]
         rows, postures = np.nonzero(weights)
         order = np.argsort(-weights[rows, postures], kind='stable')
@@ -105,7 +105,7 @@ class Postures:
         skeleton = self.body.skeleton
         own = np.flatnonzero(unseen > 0.0)
         root = list(skeleton.segment_dofs[0])
-        top = skeleton.joint_index([x for x in skeleton.trunk_joints if x in TOP])
+        top = skeleton.joint_index([x for x in skeleton.trunk_joints if x in FIXED_JOINTS])
         slopes = self.body.joint_jacobians(poses)[:, top].reshape(len(poses), -1, len(unseen))
         moves = np.zeros((len(poses), len(unseen), len(own)))
         moves[:, own, np.arange(len(own))] = 1.0

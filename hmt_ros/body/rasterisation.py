@@ -19,8 +19,8 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.inference.arrays import Array, Index, Mask
 
 STACKS, SLICES = 13, 18  # mesh of a part; its outline is exact to 2 % of its radius
-SMALLEST_AREA = 1e-6  # px^2, twice the area of a triangle; smaller ones cover no pixel centre
-CHUNK = 16  # number of poses whose silhouettes are drawn together
+MIN_AREA = 1e-6  # px^2, twice the area of a triangle; smaller ones cover no pixel centre
+BATCH_SIZE = 16  # number of poses whose silhouettes are drawn together
 
 
 def render_silhouettes(body: Body, poses: ArrayLike, camera: Camera) -> Mask:
@@ -32,11 +32,11 @@ def render_silhouettes(body: Body, poses: ArrayLike, camera: Camera) -> Mask:
     poses = np.asarray(poses, dtype=np.float64)
     mesh = mesh_of(body)
     result = np.zeros((len(poses), camera.height, camera.width), dtype=bool)
-    for start in range(0, len(poses), CHUNK):
-        frames = forward(body.skeleton, poses[start : start + CHUNK])
+    for start in range(0, len(poses), BATCH_SIZE):
+        frames = forward(body.skeleton, poses[start : start + BATCH_SIZE])
         points = frames.points(mesh.segments, mesh.vertices)
         pixels = fill(project(mesh, points, camera), camera.height, camera.width).pixels
-        result[start : start + CHUNK].reshape(-1)[pixels] = True
+        result[start : start + BATCH_SIZE].reshape(-1)[pixels] = True
     return result
 
 
@@ -93,7 +93,7 @@ def project(mesh: Mesh, points: Array, camera: Camera) -> Triangles:
     # Counter-clockwise from outside is clockwise where the v axis points down. A corner behind the
     # camera is NaN, and the triangle is left out.
     area = (u[b] - u[a]) * (v[c] - v[a]) - (v[b] - v[a]) * (u[c] - u[a])
-    visible = area < -SMALLEST_AREA
+    visible = area < -MIN_AREA
     # Far outside the image, a distortion model may map points back into it.
     (left, right), (top, bottom) = _field_of_view(camera)
     x, y, z = p

@@ -50,7 +50,7 @@ REFERENCE_JOINTS = tuple(RANGES)
 ADDED_JOINTS = ('r_torso', 'y_torso', 'l_clavicle', 'r_clavicle')
 SIDES = {'l': ('left', 1.0), 'r': ('right', -1.0)}
 # Joints of our bodies that the model needs.
-NEEDED = (
+NEEDED_JOINTS = (
     'pelvis',
     'neck',
     'head',
@@ -61,11 +61,11 @@ NEEDED = (
     ),
 )
 # Sine of the angle below which two bones count as parallel; length that counts as zero, m.
-_STRAIGHT, _NOTHING = 1e-4, 1e-3
+_PARALLEL_SINE, _ZERO_LENGTH = 1e-4, 1e-3
 # Angle by which our bodies have the hips in front of the vertical through the pelvis joint, rad.
-HIPS_AHEAD = elementary.arctan(0.33)
+HIP_ANGLE = elementary.arctan(0.33)
 # Weight of the change of angles between images relative to the excess over their ranges.
-_STEADY = 0.2
+_CHANGE_WEIGHT = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,10 +143,10 @@ def fit_reference_human(
     Raises:
         ValueError: a needed joint is missing, or both joints of a bone are at one place.
     """
-    missing = [name for name in NEEDED if name not in names]
+    missing = [name for name in NEEDED_JOINTS if name not in names]
     if missing:
         raise ValueError(f'joint positions of {", ".join(missing)} are missing')
-    at = {name: positions[list(names).index(name)] for name in NEEDED}
+    at = {name: positions[list(names).index(name)] for name in NEEDED_JOINTS}
     before = dict.fromkeys((*REFERENCE_JOINTS, *ADDED_JOINTS), 0.0) | dict(previous or {})
     origin = (at['left_hip'] + at['right_hip']) / 2
     rotation = _body_axes(at, origin)
@@ -180,7 +180,7 @@ def _direction(at: Mapping[str, Array], first: str, last: str) -> Array:
 
 def _unit(vector: Array, what: str) -> Array:
     size = length(vector)
-    if not size > _NOTHING:
+    if not size > _ZERO_LENGTH:
         raise ValueError(f'{what} are at one place: they have no direction')
     result: Array = vector / size
     return result
@@ -190,8 +190,8 @@ def _body_axes(at: Mapping[str, Array], origin: Array) -> Array:
     """Return axes (3, 3), in columns: forward, from right to left hip, and up the pelvis."""
     y = _direction(at, 'right_hip', 'left_hip')
     up = at['pelvis'] - origin
-    up = elementary.cos(HIPS_AHEAD) * up + elementary.sin(HIPS_AHEAD) * np.cross(y, up)
-    if length(up - y * product(y, up)) < _NOTHING:
+    up = elementary.cos(HIP_ANGLE) * up + elementary.sin(HIP_ANGLE) * np.cross(y, up)
+    if length(up - y * product(y, up)) < _ZERO_LENGTH:
         up = at['neck'] - origin
     z = _unit(up - y * product(y, up), 'the line of the hips and the trunk')
     return np.stack([np.cross(y, z), y, z], axis=1)
@@ -232,10 +232,10 @@ def _fit_arm(
     sine = length(bend)
     angles[f'{letter}_elbow'] = float(elementary.arctan2(sine, product(upper, lower)))
     b = float(elementary.arctan2(elementary.hypot(upper[0], upper[1]), -upper[2]))
-    hangs = elementary.sin(b) < _STRAIGHT
+    hangs = elementary.sin(b) < _PARALLEL_SINE
     a = before[names[0]] if hangs else float(elementary.arctan2(upper[0], s * upper[1]))
     c = before[names[2]]
-    if sine > _STRAIGHT:
+    if sine > _PARALLEL_SINE:
         # The elbow bends forward: its axis is the y axis of the upper arm.
         axis = product(product(_turn_z(-s * a), _turn_x(s * b)).T, bend / sine)
         c = s * float(elementary.arctan2(-axis[0], axis[1]))
@@ -255,11 +255,11 @@ def _fit_leg(
     sine = length(bend)
     angles[f'{letter}_knee'] = -float(elementary.arctan2(sine, product(thigh, shin)))
     found = []
-    if sine > _STRAIGHT:
+    if sine > _PARALLEL_SINE:
         # The knee bends backward: its axis is the y axis of the thigh, (-sin, cos cos, sin).
         y = bend / sine
         b = float(elementary.arcsin(np.clip(y[2], -1.0, 1.0)))
-        level = elementary.hypot(y[0], y[1]) > _STRAIGHT
+        level = elementary.hypot(y[0], y[1]) > _PARALLEL_SINE
         a = float(elementary.arctan2(y[0], y[1])) if level else before[names[0]]
         turns = [(a, b), (a + np.pi, np.pi - b)]
     else:
@@ -281,7 +281,7 @@ def _best_angles(
     def cost(each: tuple[float, ...]) -> float:
         terms = zip(each, (RANGES[name] for name in names), names, strict=True)
         return sum(
-            max(lo - x, x - hi, 0.0) + _STEADY * abs(_wrapped(x - before[name]))
+            max(lo - x, x - hi, 0.0) + _CHANGE_WEIGHT * abs(_wrapped(x - before[name]))
             for x, (lo, hi), name in terms
         )
 

@@ -1,7 +1,7 @@
 """Prior of trajectories with points of the body at rest on the ground, which do not move.
 
-Whether a point rests or moves is a Markov chain with the rate `CHANGES`. The evidence is the speed
-of the point along a trajectory,
+Whether a point rests or moves is a Markov chain with the rate `CHANGE_RATE`. The evidence is the
+speed of the point along a trajectory,
 
     rests: v_across ~ N(0, 0.07^2), v_away ~ N(0, 0.17^2)    moves: N(0, 0.7^2), N(0, 0.6^2)   m/s
 
@@ -32,13 +32,13 @@ from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
 
 # Standard deviations of the speed across and along the most uncertain direction, of resting and of
 # moving points in trajectories of the smoother, m/s; from the feet of the clips.
-RESTS, MOVES = (0.07, 0.17), (0.7, 0.6)
+REST_SIGMAS, MOTION_SIGMAS = (0.07, 0.17), (0.7, 0.6)
 # Rate at which a point changes between rest and motion, 1/s.
-CHANGES = 2.0
+CHANGE_RATE = 2.0
 # Variance of the slip of a resting point, m^2/s: 9 mm in a second.
-SLIP = 8e-5
+SLIP_VARIANCE = 8e-5
 # Minimum probability of rest of a constrained point.
-LEAST = 1e-3
+MIN_REST_PROBABILITY = 1e-3
 
 
 class RestingTable(NamedTuple):
@@ -92,14 +92,16 @@ class RestingPoints:
         count, d = poses.shape
         points, jacobians = self.points(poses), self.jacobians(poses)
         rests = rest_probabilities(points, jacobians, covariances, intervals)
-        if not (rests >= LEAST).any():
+        if not (rests >= MIN_REST_PROBABILITY).any():
             return None
-        weights = np.where(rests >= LEAST, rests, 0.0) / (SLIP * intervals[:, None])
+        weights = np.where(rests >= MIN_REST_PROBABILITY, rests, 0.0) / (
+            SLIP_VARIANCE * intervals[:, None]
+        )
         each = np.ascontiguousarray(jacobians.reshape(count, -1, d))
         places = points.reshape(count, -1) - product(each, poses[:, :, None])[:, :, 0]
         return RestingTable(each, places, np.repeat(weights, 3, axis=1))
 
-    def held(
+    def constrained_prior(
         self, prior: TrajectoryPrior, poses: Array, covariances: Array, intervals: Array
     ) -> TrajectoryPrior:
         """Add the resting points of a trajectory (T, d) to the prior of trajectories near it.
@@ -140,8 +142,8 @@ def rest_probabilities(
     velocities = np.diff(points, axis=0) / intervals[:, None, None]
     away = np.einsum('tpi,tpi->tp', velocities, least_known)
     across = np.linalg.norm(velocities - away[:, :, None] * least_known, axis=2)
-    log = np.stack([_log_density(across, away, sigmas) for sigmas in (RESTS, MOVES)])
-    changes = 0.5 * -elementary.expm1(-2.0 * CHANGES * intervals)
+    log = np.stack([_log_density(across, away, sigmas) for sigmas in (REST_SIGMAS, MOTION_SIGMAS)])
+    changes = 0.5 * -elementary.expm1(-2.0 * CHANGE_RATE * intervals)
     return np.asarray(_smoothed_chain(elementary.exp(log - log.max(0)), changes)[0])
 
 

@@ -21,13 +21,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.body.body import GROWTH, Body
+from hmt_ros.body.body import GROWTH_COLUMNS, Body
 from hmt_ros.body.kinematics import Frames, origin_length_jacobians, placing_of
 from hmt_ros.core import sum_shape_residuals
 from hmt_ros.inference.arrays import Array, Mask
 
-# Standard deviations over people and clothes, by kind of growth; see `GROWTH` for units.
-GROWTH_SIGMAS = dict(zip(GROWTH, (0.2, 0.2, 0.02, 0.02, 0.02), strict=True))
+# Standard deviations over people and clothes, by kind of growth; see `GROWTH_COLUMNS` for units.
+GROWTH_SIGMAS = dict(zip(GROWTH_COLUMNS, (0.2, 0.2, 0.02, 0.02, 0.02), strict=True))
 # Minimum standard deviation of a length, m.
 MIN_LENGTH_SIGMA = 0.008
 
@@ -58,12 +58,12 @@ class ShapeSpace:
     @property
     def size(self) -> int:
         """Number of variables, P."""
-        return self.lengths + len(self.groups) * len(GROWTH)
+        return self.lengths + len(self.groups) * len(GROWTH_COLUMNS)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the variables, (P,)."""
-        grown = (f'{group}_{kind}' for group in self.groups for kind in GROWTH)
+        grown = (f'{group}_{kind}' for group in self.groups for kind in GROWTH_COLUMNS)
         return (*self.body.skeleton.length_names, *grown)
 
     @property
@@ -79,10 +79,10 @@ class ShapeSpace:
         return sigmas, covariance
 
     def moved(self, change: Array) -> Body:
-        """Return the body with a changed shape, (P,): lengths in m, growth as in `GROWTH`."""
+        """Return the body with a changed shape (P,): lengths in m, then `GROWTH_COLUMNS`."""
         names, own = self.body.skeleton.length_names, self.body.skeleton.lengths
         lengths = own + change[: self.lengths]
-        grown = change[self.lengths :].reshape(len(self.groups), len(GROWTH))[self._group]
+        grown = change[self.lengths :].reshape(len(self.groups), len(GROWTH_COLUMNS))[self._group]
         body = self.body.with_segment_lengths(dict(zip(names, map(float, lengths), strict=True)))
         return body.with_growth(body.growth + grown)
 
@@ -169,7 +169,7 @@ class ShapeSpace:
                 by_centre[b, :, length] += rate * by_scale[0]
                 by_radius[b, :, length] += rate * by_scale[1]
             width, depth, more_start, more_end, shift = self.lengths + np.arange(
-                len(GROWTH) * self._group[b], len(GROWTH) * (self._group[b] + 1)
+                len(GROWTH_COLUMNS) * self._group[b], len(GROWTH_COLUMNS) * (self._group[b] + 1)
             )
             by_radius[b, 0, width], by_radius[b, 1, depth] = radii[b, :2]
             by_radius[b, 2, [more_start, more_end]] = 0.5

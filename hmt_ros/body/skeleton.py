@@ -232,13 +232,13 @@ class Skeleton:
         new.setflags(write=False)
         result = copy(self)
         object.__setattr__(result, 'lengths', new)
-        for name in _BY_LENGTHS:
+        for name in _LENGTH_PROPERTIES:
             result.__dict__.pop(name, None)
         return result
 
 
 # Cached properties that depend on the lengths of a skeleton.
-_BY_LENGTHS = ('offsets', 'joint_offsets', 'trunk_joints', 'bones')
+_LENGTH_PROPERTIES = ('offsets', 'joint_offsets', 'trunk_joints', 'bones')
 
 
 def sided_pairs(names: Iterable[str]) -> tuple[tuple[str, str], ...]:

@@ -161,22 +161,22 @@ PYBIND11_MODULE(_compiled, m) {
   // constants
   m.attr("LANES") = int(lanes);
   m.attr("RECORDED") = int(Sums::recorded);
-  m.attr("FEWEST") = fewest;
+  m.attr("MIN_POINTS") = fewest;
   m.attr("COVER") = cover;
   m.attr("BEHIND") = behind;
-  m.attr("LEAST_FACING") = least_facing;
+  m.attr("MIN_FACING") = least_facing;
   m.attr("OUTLINE_TURN") = outline_turn;
   m.attr("OUTLINE_SPACING") = outline_spacing;
   m.attr("ORIENTATIONS") = orientations;
   m.attr("ASIDE") = aside;
-  m.attr("LEAST_COSINE") = least_cosine;
+  m.attr("MIN_COSINE") = least_cosine;
   m.attr("DEPTH_JUMP") = depth_jump;
   m.attr("FLOW_SIGMA") = flow_sigma;
   m.attr("FLOW_SHARE") = flow_share;
   m.attr("FLOW_SCALE") = flow_scale;
   m.attr("DAMPING_LIMIT") = damping_limit;
-  m.attr("LEAST_FACTOR") = least_factor;
-  m.attr("LEAST_RATIO") = least_ratio;
+  m.attr("MIN_FACTOR") = least_factor;
+  m.attr("MIN_RATIO") = least_ratio;
   bind(m, "factorise_band", factorise_band, "columns");
   bind(m, "solve_band_lower", solve_band_lower, "columns x");
   bind(m, "solve_band_transposed", solve_band_transposed, "columns x");

@@ -38,23 +38,23 @@ if TYPE_CHECKING:
 SCHEME = 'mediapipe33'
 LANDMARKS = 33
 # Interval without images after which the whole image is searched again, ns.
-_LONGEST_INTERVAL = 1_000_000_000
+_MAX_INTERVAL = 1_000_000_000
 # Sides of the inputs of the networks, px, and of the heat maps of landmarks.
 _PERSON_SIZE, _LANDMARK_SIZE, _HEAT_SIZE = 224, 256, 64
 # Cell sizes of the first network, px, predictions per cell, and overlap (intersection over union)
 # above which two predictions are merged.
-_STRIDES, _PREDICTIONS, _SAME = (8, 16, 32), (2, 2, 6), 0.3
+_STRIDES, _PREDICTIONS_PER_CELL, _SAME_OVERLAP = (8, 16, 32), (2, 2, 6), 0.3
 # Minimum probability of a person, and minimum probability that a pixel belongs to the person.
-_SEEN = 0.5
+_MIN_PROBABILITY = 0.5
 # Factor on the quality of a person who lies or is upside down.
-_LYING = 0.6
+_LYING_QUALITY = 0.6
 # Half side of the window around a landmark in its heat map, cells, and minimum peak in this window.
-_HEAT_REACH, _HEAT_PEAK = 4, 0.5
+_HEAT_REACH, _MIN_HEAT_PEAK = 4, 0.5
 # Cutoffs f_0 of the one-euro filters, Hz, and factors b with which velocities raise them.
 _VELOCITY_CUTOFF = 1.0
 _LANDMARK_CUTOFF, _CIRCLE_CUTOFF, _POSITION_CUTOFF = (0.05, 80.0), (0.01, 10.0), (0.1, 40.0)
 # Weight of a new image in the smoothed visibility.
-_NEW_VISIBILITY = 0.1
+_VISIBILITY_GAIN = 0.1
 
 _Tensor = NDArray[np.float32]
 
@@ -96,7 +96,7 @@ class BlazePose:
             seen.
         """
         interval = stamp_ns - self._newest
-        if not 0 < interval <= _LONGEST_INTERVAL or image.shape[:2] != self._size:
+        if not 0 < interval <= _MAX_INTERVAL or image.shape[:2] != self._size:
             self._followed = None
         self._newest, self._size = stamp_ns, image.shape[:2]
         circle = self._circle(image) if self._followed is None else self._followed.circle
@@ -109,7 +109,7 @@ class BlazePose:
         if self._followed is None:
             self._followed = Followed()
         if self._with_mask:
-            self.mask = found.square.spread(sigmoid(found.mask), self._size) >= _SEEN
+            self.mask = found.square.spread(sigmoid(found.mask), self._size) >= _MIN_PROBABILITY
         return self._followed.smooth(found, interval * 1e-9)
 
     def _circle(self, image: Image) -> Array | None:
@@ -139,7 +139,7 @@ class Networks:
         seen = square.seen(image, _PERSON_SIZE, cv2.BORDER_CONSTANT)
         boxes, logits = self._person(seen * np.float32(2 / 255) - np.float32(1))
         scores = sigmoid(logits[:, 0].astype(np.float64))
-        chosen = np.flatnonzero(scores >= _SEEN)
+        chosen = np.flatnonzero(scores >= _MIN_PROBABILITY)
         scores = scores[chosen]
         # Centre and size of the face, then points on the body, as fractions of the square.
         points = boxes[chosen].astype(np.float64).reshape(-1, 6, 2) / _PERSON_SIZE
@@ -150,7 +150,7 @@ class Networks:
             common = np.minimum(upper, upper[best]) - np.maximum(lower, lower[best])
             area = np.prod(common.clip(0.0), axis=1)
             areas = np.prod(upper - lower, axis=1)
-            same = area > _SAME * (areas + areas[best] - area)
+            same = area > _SAME_OVERLAP * (areas + areas[best] - area)
             same[best] = True
             middle = np.average(points[same, 2:4], axis=0, weights=scores[same])
             yield float(scores[best]), square.corner + middle * square.side
@@ -162,7 +162,7 @@ class Networks:
             return None
         seen = square.seen(image, _LANDMARK_SIZE, cv2.BORDER_REPLICATE)
         flat, presence, mask, heat, world = self._landmark(seen * np.float32(1 / 255))
-        if not presence[0] > _SEEN:
+        if not presence[0] > _MIN_PROBABILITY:
             return None
         rows = flat.astype(np.float64).reshape(-1, 5)
         points = _refined(rows[:, :2] / _LANDMARK_SIZE, heat)[: LANDMARKS + 2]
@@ -207,7 +207,7 @@ class Found:
     def quality(self) -> float:
         """Presence times mean visibility, 0 to 1; reduced for a person who is not upright."""
         upright = max(float(elementary.cos(self.square.angle)), 0.0)
-        share = _LYING + (1.0 - _LYING) * upright
+        share = _LYING_QUALITY + (1.0 - _LYING_QUALITY) * upright
         return self.presence * float(self.visibilities.mean()) * share
 
 
@@ -233,7 +233,7 @@ class Followed:
         if self._visibilities is None:
             self._visibilities = found.visibilities
         change = found.visibilities - self._visibilities
-        self._visibilities = self._visibilities + _NEW_VISIBILITY * change
+        self._visibilities = self._visibilities + _VISIBILITY_GAIN * change
         pixels = self._of_landmarks(landmarks, interval, diameter)
         positions = self._of_positions(found.positions, interval, 1.0)
         unknown = np.full((LANDMARKS, 2, 2), np.nan)
@@ -285,7 +285,7 @@ class _Network:
 def _anchors() -> Array:
     """Cell centres (2254, 2) of the first network's predictions, as fractions of its image."""
     result = []
-    for stride, predictions in zip(_STRIDES, _PREDICTIONS):
+    for stride, predictions in zip(_STRIDES, _PREDICTIONS_PER_CELL):
         middles = (np.arange(_PERSON_SIZE // stride) + 0.5) * stride / _PERSON_SIZE
         cells = np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2)
         result.append(np.repeat(cells, predictions, axis=0))
@@ -306,7 +306,7 @@ def _refined(points: Array, heat: _Tensor) -> Array:
     window = window * (inside[:, 1, :, None] & inside[:, 0, None])
     profiles = np.stack([window.sum(axis=1), window.sum(axis=2)], axis=1)
     mass = np.maximum(profiles.sum(axis=2), np.finfo(np.float32).tiny)
-    hot = (window.max(axis=(1, 2)) >= _HEAT_PEAK) & inside[..., _HEAT_REACH].all(axis=1)
+    hot = (window.max(axis=(1, 2)) >= _MIN_HEAT_PEAK) & inside[..., _HEAT_REACH].all(axis=1)
     return np.where(hot[:, None], (profiles * about).sum(axis=2) / mass / _HEAT_SIZE, points)
 
 

@@ -38,7 +38,7 @@ _ANY_WHEEL = (
 
 def has_networks() -> bool:
     """Whether the files of all networks exist."""
-    return FILES.are_there()
+    return FILES.exist()
 
 
 def has_runtime() -> bool:

@@ -21,9 +21,9 @@ from hmt_ros.inference.arrays import Array, Image
 TORSO = ('left_shoulder', 'right_shoulder', 'right_hip', 'left_hip')
 LEGS = (('left_hip', 'left_knee', 'left_ankle'), ('right_hip', 'right_knee', 'right_ankle'))
 # Minimum number of pixels of a part, and width of a leg as a fraction of the length of the trunk.
-FEWEST, WIDTH = 40, 0.22
+MIN_PIXELS, LEG_WIDTH_RATIO = 40, 0.22
 # Minimum visibility of a landmark that is used, and maximum side of the image of a person, px.
-VISIBLE, SIDE = 0.5, 96
+MIN_VISIBILITY, MAX_IMAGE_SIDE = 0.5, 96
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Clothes:
     def of(cls, image: Image, keypoints: Keypoints) -> Clothes:
         """The clothes of a person in an image (H, W, 3) BGR."""
         at = dict(zip(keypoints.names, keypoints.pixels, strict=True))
-        seen = dict(zip(keypoints.names, keypoints.confidences >= VISIBLE, strict=True))
+        seen = dict(zip(keypoints.names, keypoints.confidences >= MIN_VISIBILITY, strict=True))
         counts = np.zeros((3, BINS**3), np.int64)
         low, high = (f(list(at.values()), axis=0) for f in (np.min, np.max))
         height, width = image.shape[:2]
@@ -45,7 +45,7 @@ class Clothes:
         )
         if right - left >= 2 and bottom - top >= 2:
             part = image[top:bottom, left:right]
-            scale = min(SIDE / max(part.shape[:2]), 1.0)
+            scale = min(MAX_IMAGE_SIDE / max(part.shape[:2]), 1.0)
             small = cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
             labels = np.zeros(small.shape[:2], np.uint8)
 
@@ -57,13 +57,13 @@ class Clothes:
             length = np.linalg.norm(trunk[:2].mean(0) - trunk[2:].mean(0))
             for leg in LEGS:
                 if all(seen[x] for x in leg):
-                    wide = max(round(WIDTH * length), 1)
+                    wide = max(round(LEG_WIDTH_RATIO * length), 1)
                     cv2.polylines(labels, [places(leg)], False, 2, wide)
             if all(seen[x] for x in TORSO):
                 cv2.fillConvexPoly(labels, cv2.convexHull(trunk), 1)
             count_colours(binned(np.asarray(small, np.uint8)), labels, counts)
         sizes = counts[1:].sum(1, keepdims=True)
-        return cls(np.where(sizes >= FEWEST, counts[1:] / np.maximum(sizes, 1), np.nan))
+        return cls(np.where(sizes >= MIN_PIXELS, counts[1:] / np.maximum(sizes, 1), np.nan))
 
     def distance(self, other: Clothes) -> float:
         """Mean distance over the parts that both have, 0 to 1; NaN if they share no part."""

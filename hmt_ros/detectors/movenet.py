@@ -33,11 +33,11 @@ from hmt_ros.inference.arrays import Array, Image, Mask
 
 SCHEME = 'coco17'
 # Offset added to the distance of a cell from the expected place of a landmark, cells.
-_NEAR = 1.8
+_DISTANCE_OFFSET = 1.8
 # MoveNet's share in the mean, and minimum score of a landmark that is used.
-_SHARE, _LEAST_SCORE = 2 / 3, 0.3
+_MEAN_WEIGHT, _MIN_SCORE = 2 / 3, 0.3
 # Index of the first of MoveNet's landmarks that is not in the face.
-_BODY = 5
+_FIRST_BODY_LANDMARK = 5
 
 
 class MoveNet:
@@ -78,7 +78,7 @@ def chosen(
     cells = np.arange(CELLS)
     down, along = (cells - expected[..., None]).swapaxes(0, 1)
     distances = np.sqrt(down[:, :, None] ** 2 + along[:, None] ** 2)
-    likely = (heat / (distances + _NEAR)).reshape(len(heat), -1)
+    likely = (heat / (distances + _DISTANCE_OFFSET)).reshape(len(heat), -1)
     rows, columns = np.divmod(likely.argmax(axis=1), CELLS)
     each = np.arange(len(heat))
     moved = offsets.reshape(-1, 2, CELLS, CELLS)[each, :, rows, columns]
@@ -107,11 +107,13 @@ class BlazePoseAndMoveNet:
         told = self._second.landmarks(square.seen(image, SIZE, cv2.BORDER_REPLICATE))
         # The network's origin is the edge of the first pixel of the square.
         pixels = square.corner + square.side * (told[:, :2] - 0.5 / SIZE)
-        rows = np.array([found.names.index(name) for name in schemes()[SCHEME].names[_BODY:]])
+        rows = np.array(
+            [found.names.index(name) for name in schemes()[SCHEME].names[_FIRST_BODY_LANDMARK:]]
+        )
         own = found.pixels[rows]
         inside = (own >= -0.5).all(axis=1) & (own <= last + 0.5).all(axis=1)
-        counted = inside & (told[_BODY:, 2] >= _LEAST_SCORE)
-        return together(found, rows[counted], pixels[_BODY:][counted])
+        counted = inside & (told[_FIRST_BODY_LANDMARK:, 2] >= _MIN_SCORE)
+        return together(found, rows[counted], pixels[_FIRST_BODY_LANDMARK:][counted])
 
 
 def together(found: Keypoints, rows: NDArray[np.intp], pixels: Array) -> Keypoints:
@@ -124,7 +126,7 @@ def together(found: Keypoints, rows: NDArray[np.intp], pixels: Array) -> Keypoin
     """
     apart = pixels - found.pixels[rows]
     places, covariances = found.pixels.copy(), found.covariances.copy()
-    places[rows] += _SHARE * apart
+    places[rows] += _MEAN_WEIGHT * apart
     sigma = found.magnification() * noise_of(found.confidences[rows])
     spread = apart[:, :, None] * apart[:, None] / 4
     covariances[rows] = sigma[:, None, None] ** 2 * np.eye(2) + spread
@@ -132,7 +134,7 @@ def together(found: Keypoints, rows: NDArray[np.intp], pixels: Array) -> Keypoin
 
 
 def _is_installed() -> bool:
-    return blazepose_models.is_installed() and movenet_models.FILES.are_there()
+    return blazepose_models.is_installed() and movenet_models.FILES.exist()
 
 
 def _install() -> None:

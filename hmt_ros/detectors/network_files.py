@@ -50,7 +50,7 @@ class NetworkFiles:
                     return data
         return None
 
-    def are_there(self) -> bool:
+    def exist(self) -> bool:
         """Whether all files exist and have the right checksums."""
         return all(self.content(name) is not None for name in self.checksums)
 

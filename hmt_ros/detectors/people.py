@@ -1,16 +1,16 @@
 """Detects several people per image with BlazePose, and keeps their identities.
 
 - The person network reliably finds people who fill 0.4 to 0.8 of its input. It searches the whole
-  image and overlapping tiles; the smallest tiles suit people `SMALLEST` px high. The first image is
-  searched completely, later images a few tiles at a time, so that each tile is searched once in
-  `SEARCH` s. The expected place of a lost person is searched, too. Known people are ignored.
+  image and overlapping tiles; the smallest tiles suit people `MIN_HEIGHT` px high. The first image
+  is searched completely, later images a few tiles at a time, so that each tile is searched once in
+  `SEARCH_TIME` s. The expected place of a lost person is searched, too. Known people are ignored.
 - The landmark network sees a square around each person: the square of the last image, shifted by
   the person's velocity.
 - If two squares show the same body, the detection of better quality is kept.
 - Detections are assigned to known people by position, velocity and the colours of clothes. The
   assignment has the smallest sum of costs, nats (`_Person.cost`, `clothes`).
 - A person who is lost near a visible person is searched for with the visible people painted over.
-  A person who is lost for longer than `KEPT` gets a new identity.
+  A person who is lost for longer than `KEPT_TIME` gets a new identity.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from hmt_ros.detectors.blazepose import SCHEME, Followed, Found, Networks
-from hmt_ros.detectors.clothes import VISIBLE, Clothes
+from hmt_ros.detectors.clothes import MIN_VISIBILITY, Clothes
 from hmt_ros.detectors.square import Square
 from hmt_ros.image.association import ImageTrack, Sighting
 from hmt_ros.image.keypoint_schemes import schemes
@@ -33,39 +33,39 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.inference.error_model import seconds
 
-MOST = 4  # maximum number of people
+MAX_PEOPLE = 4  # maximum number of people
 # Time in which all tiles are searched, interval between searches for a lost person, and time after
 # which a lost person is forgotten, s.
-SEARCH, LOOK, KEPT = 1.0, 0.1, 3.0
+SEARCH_TIME, LOOK_INTERVAL, KEPT_TIME = 1.0, 0.1, 3.0
 # Gap after which smoothing restarts, s; age at which a doubtful person is confirmed, s; minimum
 # quality of a person who is confirmed at once.
-LOST, CONFIRMED, EVIDENT = 0.5, 0.3, 0.75
+LOST_TIME, CONFIRMATION_TIME, EVIDENT_QUALITY = 0.5, 0.3, 0.75
 # Height of the smallest people, px; fraction of the smallest tile that they fill; maximum ratio of
 # successive tile sizes; overlap of neighbouring tiles, as a fraction of a tile.
-SMALLEST, FILLED, RATIO, OVERLAP = 150.0, 0.4, 1.9, 0.4
+MIN_HEIGHT, FILLED_FRACTION, TILE_RATIO, TILE_OVERLAP = 150.0, 0.4, 1.9, 0.4
 # Time without a change after which a person is a picture, and interval between comparisons, s.
-STILL, COMPARED = 10.0, 1.0
+PICTURE_TIME, COMPARISON_INTERVAL = 10.0, 1.0
 # Limits for two detections to be one person: distance of new circles, in radii; distance of
 # landmarks, in sizes; difference from a known circle, in radii; overlap, in smaller boxes.
-SAME_CIRCLE, SAME_BODY, ALIKE, CONTAINED = 0.6, 0.08, 0.25, 0.8
+SAME_CIRCLE_DISTANCE, SAME_BODY_DISTANCE, ALIKE_DISTANCE, CONTAINED_FRACTION = 0.6, 0.08, 0.25, 0.8
 # Size ratio above which two detections are different people; distance below which people are
 # neighbours, in sizes.
-LARGEST_RATIO, BESIDE = 1.6, 1.0
+MAX_RATIO, APART_DISTANCE = 1.6, 1.0
 # Grey level with which people are painted over.
-GREY = 128
+GREY_LEVEL = 128
 # Factors on the radius of a detected circle, which may be too small.
 SCALES = (1.0, 1.5, 2.4)
 # Standard deviation of the position of a person, in sizes, its growth per second, and the fraction
 # of the speed that adds to this growth, because a moving person may turn round.
-NEAR, SPEED, TURN = 0.08, 0.35, 0.5
+PLACE_SIGMA, SIGMA_GROWTH, SPEED_SHARE = 0.08, 0.35, 0.5
 # Distance of clothes that is equally likely for one person and for two, change of it that is worth
 # 1 nat, and maximum effect, nats. 99 % of distances within a person are below 0.47, and 95 % of
 # distances between people are above.
-DIFFERENT, DOUBT, MOST_NATS = 0.4, 0.06, 4.0
+NEUTRAL_DISTANCE, DISTANCE_PER_NAT, MAX_NATS = 0.4, 0.06, 4.0
 # Maximum cost of an assignment, and cost below which the clothes of a person are updated, nats.
-LARGEST, SURE = 3.0, 0.0
+MAX_COST, LEARNING_COST = 3.0, 0.0
 # Time constant of the clothes of a person, s; minimum number of visible landmarks.
-CLOTHES_TIME, FEWEST = 2.0, 8
+CLOTHES_TIME, MIN_LANDMARKS = 2.0, 8
 
 # Indices of the landmarks of trunk and limbs, and their permutation that exchanges the sides.
 _NAMES = schemes()[SCHEME].names
@@ -85,7 +85,8 @@ class SeenPerson(NamedTuple):
         name: identity, p1, p2, ...
         keypoints: landmarks of the scheme 'mediapipe33'.
         corners: (2, 2) top left and bottom right corner of the visible landmarks, px.
-        still: whether the image around the person has not changed for `STILL` s, as for a poster.
+        still: whether the image around the person has not changed for `PICTURE_TIME` s, as for a
+            poster.
     """
 
     name: str
@@ -128,26 +129,28 @@ class _Person:
         """Cost of assigning a detection to this person rather than to another one, nats."""
         dt = seconds(stamp - self.place.stamp)
         speed = float(np.linalg.norm(self.place.velocity)) / self.place.size
-        away = self.place.cost(one.sighting, stamp) / (NEAR + (SPEED + TURN * speed) * dt)
-        colours = (self.clothes.distance(one.clothes) - DIFFERENT) / DOUBT
-        return 0.5 * away * away + float(np.clip(np.nan_to_num(colours), -MOST_NATS, MOST_NATS))
+        away = self.place.cost(one.sighting, stamp) / (
+            PLACE_SIGMA + (SIGMA_GROWTH + SPEED_SHARE * speed) * dt
+        )
+        colours = (self.clothes.distance(one.clothes) - NEUTRAL_DISTANCE) / DISTANCE_PER_NAT
+        return 0.5 * away * away + float(np.clip(np.nan_to_num(colours), -MAX_NATS, MAX_NATS))
 
     def update(self, image: Image, one: _Sighted, stamp: int) -> None:
         """Updates the person from a detection in the next image."""
-        if seconds(stamp - self.compared) >= COMPARED:
+        if seconds(stamp - self.compared) >= COMPARISON_INTERVAL:
             self.compared = stamp
             if not self.picture.shows_again(image, one.keypoints):
                 self.changed = stamp
         interval = seconds(stamp - self.seen)
         known = seconds(stamp - self.begun)
-        if known < CLOTHES_TIME or self.cost(one, stamp) < SURE:
+        if known < CLOTHES_TIME or self.cost(one, stamp) < LEARNING_COST:
             share = interval / min(known, CLOTHES_TIME)
             self.clothes = self.clothes.mixed(one.clothes, min(share, 1.0))
-        if interval > LOST:
+        if interval > LOST_TIME:
             self.followed = Followed()
         self.keypoints = self.followed.smooth(one.found, interval)
         self.place.update(one.sighting, stamp)
-        self.seen, self.sure = stamp, self.sure or known >= CONFIRMED
+        self.seen, self.sure = stamp, self.sure or known >= CONFIRMATION_TIME
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +188,7 @@ class PeopleDetector:
         DetectorError: the detector is not installed.
     """
 
-    def __init__(self, most: int = MOST, networks: Networks | None = None) -> None:
+    def __init__(self, most: int = MAX_PEOPLE, networks: Networks | None = None) -> None:
         self.left_out = 0
         self._most = most
         self._networks = networks or Networks()
@@ -206,7 +209,7 @@ class PeopleDetector:
         """
         interval = stamp_ns - self._newest
         if interval <= 0 or image.shape[:2] != self._size:
-            self._people, interval = [], round(SEARCH * 1e9)
+            self._people, interval = [], round(SEARCH_TIME * 1e9)
         self._size, self._newest = image.shape[:2], stamp_ns
         known = [x for x in self._people if x.seen + interval == stamp_ns]
         sighted = [
@@ -218,14 +221,14 @@ class PeopleDetector:
         found += self._searched(image, found, self._tiles_due(interval) + _places(lost, stamp_ns))
         self._assign(image, _single(found), stamp_ns)
         self._people = [
-            x for x in self._people if seconds(stamp_ns - x.seen) <= (KEPT if x.sure else 0.0)
+            x for x in self._people if seconds(stamp_ns - x.seen) <= (KEPT_TIME if x.sure else 0.0)
         ]
         return [
             SeenPerson(
                 x.name,
                 x.keypoints,
                 x.place.sighting.corners,
-                seconds(stamp_ns - x.changed) >= STILL,
+                seconds(stamp_ns - x.changed) >= PICTURE_TIME,
             )
             for x in self._people
             if x.seen == stamp_ns and x.sure
@@ -249,8 +252,8 @@ class PeopleDetector:
         if found is None:
             return None
         keypoints = Followed().smooth(found, 0.0)
-        seen = keypoints[np.flatnonzero(keypoints.confidences >= VISIBLE)]
-        if len(seen.names) < FEWEST:
+        seen = keypoints[np.flatnonzero(keypoints.confidences >= MIN_VISIBILITY)]
+        if len(seen.names) < MIN_LANDMARKS:
             return None
         corners = np.stack([seen.pixels.min(0), seen.pixels.max(0)])
         clothes = Clothes.of(image, keypoints)
@@ -259,7 +262,7 @@ class PeopleDetector:
     def _tiles_due(self, interval: int) -> list[Square]:
         """Tiles to search in an image, `interval` ns after the previous image."""
         tiles = _tiles(*self._size[::-1])
-        due = self._due_tiles + len(tiles) * seconds(interval) / SEARCH
+        due = self._due_tiles + len(tiles) * seconds(interval) / SEARCH_TIME
         count = int(min(due, len(tiles)))
         result = [tiles[(self._next_tile + i) % len(tiles)] for i in range(count)]
         self._next_tile, self._due_tiles = self._next_tile + count, min(due - count, 1.0)
@@ -273,7 +276,7 @@ class PeopleDetector:
         result = []
         for square in squares:
             for _, circle in self._networks.circles(image, square):
-                if any(_apart(x, circle) < SAME_CIRCLE for x in looked):
+                if any(_apart(x, circle) < SAME_CIRCLE_DISTANCE for x in looked):
                     continue
                 looked.append(circle)
                 if not any(_alike(x.circle, circle) for x in known):
@@ -288,8 +291,8 @@ class PeopleDetector:
         costs = np.array([[x.cost(one, stamp) for one in sighted] for x in self._people])
         pairs: dict[int, _Person] = {}
         if costs.size:
-            rows, columns = linear_sum_assignment(np.minimum(costs, LARGEST))
-            pairs = {j: self._people[i] for i, j in zip(rows, columns) if costs[i, j] < LARGEST}
+            rows, columns = linear_sum_assignment(np.minimum(costs, MAX_COST))
+            pairs = {j: self._people[i] for i, j in zip(rows, columns) if costs[i, j] < MAX_COST}
         room = self._most - len(pairs)
         left = [one for j, one in enumerate(sighted) if j not in pairs]
         left.sort(key=lambda x: -x.sighting.size)
@@ -310,27 +313,28 @@ class PeopleDetector:
     ) -> _Sighted | None:
         """Detection of a lost person with the visible people there painted over, or None."""
         circle = person.followed.circle + person.place.shift(stamp)
-        before = [x for x in sighted if _apart(x.circle, circle) < BESIDE]
+        before = [x for x in sighted if _apart(x.circle, circle) < APART_DISTANCE]
         if not before:
             return None
         painted = image.copy()
         for other in before:
             body = other.found.square.spread(other.found.mask, self._size) > 0.0
-            painted[body] = GREY
+            painted[body] = GREY_LEVEL
         one = self._look(painted, circle)
         if one is None or any(_same_body(one, other) for other in before):
             return None
-        return one if person.cost(one, stamp) < LARGEST else None
+        return one if person.cost(one, stamp) < MAX_COST else None
 
     def _new(self, one: _Sighted, stamp: int) -> _Person:
         self._count += 1
         before = [x for x in self._people if x.begun < stamp]
-        beside = any(x.place.cost(one.sighting, stamp) < BESIDE for x in before)
+        beside = any(x.place.cost(one.sighting, stamp) < APART_DISTANCE for x in before)
         followed = Followed()
         keypoints = followed.smooth(one.found, 0.0)
         return _Person(
             f'p{self._count}', ImageTrack(one.sighting, stamp), one.clothes, followed, keypoints,
-            stamp, stamp, stamp, one.found.quality >= EVIDENT and not beside, StillPicture(), stamp,
+            stamp, stamp, stamp,
+            one.found.quality >= EVIDENT_QUALITY and not beside, StillPicture(), stamp,
             stamp,
         )  # fmt: skip
 
@@ -339,18 +343,18 @@ def _places(lost: list[_Person], stamp: int) -> list[Square]:
     """Squares around the expected places of lost people, if a search is due."""
     result = []
     for person in lost:
-        if seconds(stamp - person.looked) >= LOOK:
+        if seconds(stamp - person.looked) >= LOOK_INTERVAL:
             person.looked = stamp
             middle = person.place.sighting.middle + person.place.shift(stamp)
-            result.append(Square((middle[0], middle[1]), person.place.size / FILLED, 0.0))
+            result.append(Square((middle[0], middle[1]), person.place.size / FILLED_FRACTION, 0.0))
     return result
 
 
 @lru_cache(maxsize=4)
 def _tiles(width: int, height: int) -> list[Square]:
     """The whole image and overlapping square tiles of it, largest first."""
-    whole, least = float(max(width, height)), SMALLEST / FILLED
-    levels = max(math.ceil(math.log(whole / least) / math.log(RATIO)), 0)
+    whole, least = float(max(width, height)), MIN_HEIGHT / FILLED_FRACTION
+    levels = max(math.ceil(math.log(whole / least) / math.log(TILE_RATIO)), 0)
     result = [Square((width / 2, height / 2), whole, 0.0)]
     for level in range(1, levels + 1):
         side = whole * (least / whole) ** (level / levels)
@@ -361,8 +365,8 @@ def _tiles(width: int, height: int) -> list[Square]:
 
 def _middles(length: int, side: float) -> list[float]:
     """Centres of the tiles along one axis of the image."""
-    beyond = length - (1.0 + 0.25 * OVERLAP) * side
-    count = 1 + max(math.ceil(beyond / ((1.0 - OVERLAP) * side)), 0)
+    beyond = length - (1.0 + 0.25 * TILE_OVERLAP) * side
+    count = 1 + max(math.ceil(beyond / ((1.0 - TILE_OVERLAP) * side)), 0)
     if count == 1:
         return [length / 2]
     return [float(x) for x in np.linspace(side / 2, length - side / 2, count)]
@@ -376,7 +380,9 @@ def _apart(circle: Array, other: Array) -> float:
 
 def _alike(circle: Array, other: Array) -> bool:
     one, two = (float(np.linalg.norm(x[1] - x[0])) for x in (circle, other))
-    return _apart(circle, other) < ALIKE and max(one, two) < (1.0 + ALIKE) * min(one, two)
+    return _apart(circle, other) < ALIKE_DISTANCE and max(one, two) < (1.0 + ALIKE_DISTANCE) * min(
+        one, two
+    )
 
 
 def _single(sighted: list[_Sighted]) -> list[_Sighted]:
@@ -394,15 +400,15 @@ def _same_body(one: _Sighted, other: _Sighted) -> bool:
     Left and right may be exchanged. If only the boxes overlap, the colours must be similar.
     """
     sizes = sorted((one.sighting.size, other.sighting.size))
-    if sizes[1] > LARGEST_RATIO * sizes[0]:
+    if sizes[1] > MAX_RATIO * sizes[0]:
         # A child in front of an adult is another person.
         return False
     first, second = (x.keypoints.pixels[_BODY] for x in (one, other))
     away = min(float(np.median(np.linalg.norm(first - x, axis=1))) for x in (second, second[_SWAP]))
-    if away < SAME_BODY * sizes[0]:
+    if away < SAME_BODY_DISTANCE * sizes[0]:
         return True
     low, high = one.sighting.corners, other.sighting.corners
     common = np.minimum(low[1], high[1]) - np.maximum(low[0], high[0])
     areas = [float(np.prod(x[1] - x[0])) for x in (low, high)]
-    within = float(np.prod(common.clip(0.0))) > CONTAINED * min(areas)
-    return within and not one.clothes.distance(other.clothes) > DIFFERENT
+    within = float(np.prod(common.clip(0.0))) > CONTAINED_FRACTION * min(areas)
+    return within and not one.clothes.distance(other.clothes) > NEUTRAL_DISTANCE

@@ -14,9 +14,9 @@ DETECTORS: dict[str, DetectorKind] = {
 # Default detector.
 USUAL_DETECTOR = 'mediapipe'
 # Detectors for use without a time limit, most accurate first.
-_SUREST = ('mediapipe+movenet', USUAL_DETECTOR)
+_BY_ACCURACY = ('mediapipe+movenet', USUAL_DETECTOR)
 
 
 def surest_detector() -> str | None:
     """Name of the most accurate installed detector; None if none is installed."""
-    return next((name for name in _SUREST if DETECTORS[name].is_installed()), None)
+    return next((name for name in _BY_ACCURACY if DETECTORS[name].is_installed()), None)

@@ -18,9 +18,9 @@ from hmt_ros.inference.arrays import Array
 ANKLES = ('left_ankle', 'right_ankle')
 FEET = (*ANKLES, 'left_toe', 'right_toe')
 # Maximum depth below the floor at which a joint does not count as sunk, m.
-SUNK = 0.02
+MAX_SINKING = 0.02
 # Maximum interval between neighbouring frames, relative to the median interval.
-_GAP = 1.5
+_MAX_GAP_RATIO = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class GroundScores:
     Attributes:
         sliding: mean speed of standing ankles, m/s; None if no foot is known to stand.
         depth: mean depth of ankles and toes below the floor, m; joints above count as 0.
-        sunk: fraction of the frames in which an ankle or a toe is deeper than `SUNK`.
+        sunk: fraction of the frames in which an ankle or a toe is deeper than `MAX_SINKING`.
         frames: number of frames.
     """
 
@@ -71,7 +71,7 @@ class GroundScores:
         sliding = '' if self.sliding is None else f'standing ankles slide {self.sliding:.3f} m/s; '
         return (
             f'{sliding}ankles and toes lie {1e3 * self.depth:.1f} mm below the floor on average, '
-            f'one more than {1e3 * SUNK:.0f} mm in {self.sunk:.0%} of the frames'
+            f'one more than {1e3 * MAX_SINKING:.0f} mm in {self.sunk:.0%} of the frames'
         )
 
 
@@ -144,7 +144,7 @@ def ground_scores(
     return GroundScores(
         sliding=_sliding(stamps, joints, names, truth),
         depth=float(depths.mean()),
-        sunk=float((depths.max(1) > SUNK).mean()),
+        sunk=float((depths.max(1) > MAX_SINKING).mean()),
         frames=len(stamps),
     )
 
@@ -158,7 +158,7 @@ def _sliding(
     """Return the mean speed of standing ankles, m/s; None if no foot is known to stand."""
     if len(stamps) < 2:
         return None
-    usual = _GAP * float(np.median(np.diff(stamps)))
+    usual = _MAX_GAP_RATIO * float(np.median(np.diff(stamps)))
     speeds = []
     for side, ankle in enumerate(ANKLES):
         if ankle not in names:

@@ -53,11 +53,11 @@ HIPS = ('left_hip', 'right_hip')
 # Additional standard deviation of a coordinate (s above), m.
 MODEL_SIGMA = 0.0
 # Minimum mean joint error of the best component at which a frame counts as lost, m.
-LOST = 0.15
+LOST_ERROR = 0.15
 # Number of samples of a density from which a level is estimated.
-SAMPLES = 500
+LEVEL_SAMPLES = 500
 # Number of mixtures whose kinematics are computed together.
-BATCH = 32
+BATCH_SIZE = 32
 
 
 def origin_joints(names: Sequence[str], source: str = 'truth') -> tuple[str, ...]:
@@ -173,14 +173,14 @@ def joint_mixtures(
     own = np.diag(np.repeat(np.square(body.joint_errors[which]) + model_sigma**2, 3))
     result = []
     # Kinematics are computed in batches, ten times as fast as frame by frame.
-    for first in range(0, len(mixtures), BATCH):
-        batch = mixtures[first : first + BATCH]
+    for first in range(0, len(mixtures), BATCH_SIZE):
+        batch = mixtures[first : first + BATCH_SIZE]
         means = np.concatenate([mixture.means for mixture in batch])
         jacobians = relative(body.joint_jacobians(means)).reshape(len(means), -1, body.dimension)
         if positions is None:
             joints = body.joint_positions(means)
         else:
-            joints = np.concatenate(positions[first : first + BATCH])
+            joints = np.concatenate(positions[first : first + BATCH_SIZE])
         joints = relative(joints)
         ends = np.cumsum([len(mixture) for mixture in batch])
         for mixture, end in zip(batch, ends, strict=True):
@@ -264,8 +264,8 @@ class Scores:
         for key, value in errors.items():
             result[f'{key}_mm'] = float(value.mean())
             result[f'{key}_max_mm'] = float(value.max())
-        result['frames_lost'] = int((errors['best'] >= 1e3 * LOST).sum())
-        result['fraction_tracked'] = float((errors['best'] < 1e3 * LOST).mean())
+        result['frames_lost'] = int((errors['best'] >= 1e3 * LOST_ERROR).sum())
+        result['fraction_tracked'] = float((errors['best'] < 1e3 * LOST_ERROR).mean())
         known = self.levels is not None
         result['negative_log_likelihood'] = (
             -float(np.mean(self.log_densities)) if self.log_densities is not None else None
@@ -303,7 +303,7 @@ def marginal_regions(
     truth: Array,
     *,
     seed: int | np.random.Generator = 0,
-    samples: int = SAMPLES,
+    samples: int = LEVEL_SAMPLES,
 ) -> tuple[Array, Array]:
     """Compute levels of the true positions and volumes of the credible regions, joint by joint.
 
@@ -336,7 +336,7 @@ def score(
     names: Sequence[str] = EVALUATED_JOINTS,
     *,
     seed: int | np.random.Generator = 0,
-    samples: int = SAMPLES,
+    samples: int = LEVEL_SAMPLES,
 ) -> Scores:
     """Score mixtures at T times.
 

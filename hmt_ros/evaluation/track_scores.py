@@ -14,7 +14,7 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.evaluation.ground_scores import GroundScores, TrueGround, ground_scores
 from hmt_ros.evaluation.pose_scores import (
-    BATCH,
+    BATCH_SIZE,
     EVALUATED_JOINTS,
     MODEL_SIGMA,
     JointMixture,
@@ -29,9 +29,9 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.mixture import GaussianMixture
 
 # Minimum number of evaluated joints that a truth must have.
-_FEWEST_JOINTS = 4
+_MIN_JOINTS = 4
 # Maximum distance at which recorded joint positions agree with the kinematics of a body, m.
-_SAME_PLACE = 1e-3
+_POSITION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,10 +75,10 @@ class Truth:
             ValueError: the truth has fewer than four of these joints.
         """
         known = tuple(name for name in EVALUATED_JOINTS if name in self.joint_names)
-        if len(known) < _FEWEST_JOINTS:
+        if len(known) < _MIN_JOINTS:
             raise ValueError(
                 f'{self.source} knows {list(known)} of the evaluated joints, wanted at least '
-                f'{_FEWEST_JOINTS} of {list(EVALUATED_JOINTS)}'
+                f'{_MIN_JOINTS} of {list(EVALUATED_JOINTS)}'
             )
         return known
 
@@ -171,7 +171,7 @@ class TrackScorer:
         if self._waiting and self._waiting[-1].body is not estimate.body:
             self._score_waiting()
         self._waiting.append(estimate)
-        if len(self._waiting) == BATCH:
+        if len(self._waiting) == BATCH_SIZE:
             self._score_waiting()
 
     def take_window(self, estimates: Sequence[Estimate]) -> None:
@@ -280,7 +280,7 @@ def _is_elsewhere(body: Body, estimate: Estimate) -> bool:
     if estimate.joint_names != body.joint_names:
         return True
     computed = body.joint_positions(estimate.mixture.means)
-    return bool(np.abs(computed - estimate.positions).max() > _SAME_PLACE)
+    return bool(np.abs(computed - estimate.positions).max() > _POSITION_TOLERANCE)
 
 
 def mode_errors(

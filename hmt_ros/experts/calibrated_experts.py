@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hmt_ros.body.learned_file import LARGEST, Arrays, nested, parameters_of, part, require
+from hmt_ros.body.learned_file import MAX_POSITIVE, Arrays, nested, parameters_of, part, require
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity, stored_model
 from hmt_ros.experts.gates import log_softmax
 from hmt_ros.inference.arrays import Array
@@ -54,7 +54,7 @@ class Calibration:
         same = np.allclose(self.added, self.added.T)
         require(same and least >= -1e-9 * largest, 'added must be positive semidefinite')
         for name in ('temperature', 'factor'):
-            require(1.0 <= getattr(self, name) <= LARGEST, f'{name} must be at least 1')
+            require(1.0 <= getattr(self, name) <= MAX_POSITIVE, f'{name} must be at least 1')
 
     def of(self, found: Components) -> Components:
         """The calibrated mixtures."""

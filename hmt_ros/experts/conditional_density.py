@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.learned_file import (
-    MOST_NUMBERS,
-    MOST_VALUES,
+    MAX_INPUTS,
+    MAX_VALUES,
     Arrays,
     check_covariances,
     check_header,
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 
 # Maximum number of outputs of a model; a pose has forty.
-MOST_OUTPUTS = 1000
+MAX_OUTPUTS = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,9 +200,9 @@ class ConditionalDensity(ABC):
         check_header(arrays, cls.kind)
         inputs, outputs = (int(n) for n in arrays['shape'])
         require(
-            1 <= inputs <= MOST_NUMBERS and 1 <= outputs <= MOST_OUTPUTS,
-            f'{inputs} inputs and {outputs} outputs, wanted 1 to {MOST_NUMBERS} and 1 to '
-            f'{MOST_OUTPUTS}',
+            1 <= inputs <= MAX_INPUTS and 1 <= outputs <= MAX_OUTPUTS,
+            f'{inputs} inputs and {outputs} outputs, wanted 1 to {MAX_INPUTS} and 1 to '
+            f'{MAX_OUTPUTS}',
         )
         model = cls._constructed(arrays)
         model.n_inputs_, model.n_outputs_ = inputs, outputs
@@ -241,7 +241,7 @@ class ConditionalDensity(ABC):
         m, parts = found.log_weights.shape[-1], [*vars(found).values()]
         shapes = [x.shape for x in parts]
         require(shapes == [(2, m), (2, m, d), (2, m), (m, d, d)], 'its predictions do not fit')
-        require(m * d * max(d, self.n_inputs_) <= MOST_VALUES, 'its predictions are too large')
+        require(m * d * max(d, self.n_inputs_) <= MAX_VALUES, 'its predictions are too large')
         parts += [self.jacobians(inputs), self.support(inputs)]
         require(all(np.isfinite(x).all() for x in parts), 'its predictions are not finite')
         check_covariances('noise', found.noise)

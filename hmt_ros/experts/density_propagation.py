@@ -26,7 +26,7 @@ from hmt_ros.inference.linear_algebra import product
 from hmt_ros.inference.reduction import reduced
 
 # Minimum of `ConditionalDensity.support`; below it, the input is unlike all training data.
-LEAST_SUPPORT = 1e-3
+MIN_SUPPORT = 1e-3
 
 
 def propagate(
@@ -61,7 +61,7 @@ def propagate(
                 f'without_past has dimension {without_past.dimension}, '
                 f'wanted {model.n_outputs_} as the model predicts'
             )
-        trusted = model.support(inputs) >= LEAST_SUPPORT
+        trusted = model.support(inputs) >= MIN_SUPPORT
     lost = float(previous.weights[~trusted].sum())
     parts = []
     if trusted.any():

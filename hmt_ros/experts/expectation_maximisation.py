@@ -29,7 +29,7 @@ from hmt_ros.inference.arrays import Array, Index
 Learner = Callable[[WeightedSums, SparseRegression | None], SparseRegression]
 
 # Minimum number of samples of an expert that is kept; the largest expert is always kept.
-LEAST_SAMPLES = 2.0
+MIN_SAMPLES = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ def climb(
     shares = e_step(features, state)
     for _ in range(iterations):
         samples = features.weights @ shares
-        kept = np.flatnonzero(samples >= min(LEAST_SAMPLES, float(samples.max())))
+        kept = np.flatnonzero(samples >= min(MIN_SAMPLES, float(samples.max())))
         if len(kept) < shares.shape[1]:
             state = state.without_others(kept)
             shares = e_step(features, state)

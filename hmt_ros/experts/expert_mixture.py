@@ -61,9 +61,9 @@ TRIAL_SAMPLES = 1000
 # Noise variance preferred by the prior, relative to the targets' variance.
 NOISE_FLOOR = 1e-2
 # Maximum number of experts in a file, and of basis functions of an expert.
-MOST_EXPERTS, MOST_ACTIVE = 1000, 2000
+MAX_EXPERTS, MAX_ACTIVE_FUNCTIONS = 1000, 2000
 # Tolerance for rounding errors in correlations of weights: covariances vary by many orders.
-SEMIDEFINITE = 1e-6
+SEMIDEFINITE_TOLERANCE = 1e-6
 
 
 class ExpertMixture(ConditionalDensity):
@@ -306,7 +306,7 @@ class ExpertMixture(ConditionalDensity):
 
     def _set_learned(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         count = int(arrays['n_experts'])
-        require(1 <= count <= MOST_EXPERTS, f'{count} experts, wanted 1 to {MOST_EXPERTS}')
+        require(1 <= count <= MAX_EXPERTS, f'{count} experts, wanted 1 to {MAX_EXPERTS}')
         self._scaling = Standardisation(arrays['input_centre'], arrays['input_scale'])
         self._target_scaling = Standardisation(arrays['target_centre'], arrays['target_scale'])
         self.basis_ = basis_of(part('basis', arrays))
@@ -343,9 +343,9 @@ def _stored_expert(own: Mapping[str, NDArray[Any]]) -> SparseRegression:
     """Read a regression; raises ValueError if its functions or covariances are invalid."""
     active, covariance = own['active'], own['covariance']
     m = len(active)
-    different = m == len(np.unique(active)) <= MOST_ACTIVE and (active >= 0).all()
-    require(different, f'an expert names functions twice, or more than {MOST_ACTIVE}')
-    check_covariances('the covariance of weights', covariance, SEMIDEFINITE)
+    different = m == len(np.unique(active)) <= MAX_ACTIVE_FUNCTIONS and (active >= 0).all()
+    require(different, f'an expert names functions twice, or more than {MAX_ACTIVE_FUNCTIONS}')
+    check_covariances('the covariance of weights', covariance, SEMIDEFINITE_TOLERANCE)
     return SparseRegression(
         active, own['precisions'], own['weights'], covariance, own['noise'], np.nan
     )

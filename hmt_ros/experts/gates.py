@@ -41,11 +41,11 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import inverse_triangular, product
 
 # Gamma hyperprior of precisions: shape and rate (BME 2.2.2).
-SHAPE, RATE = 1e-2, 1e-4
+GAMMA_SHAPE, GAMMA_RATE = 1e-2, 1e-4
 # Lower bound of precisions; without it, a gate that grows ever sharper would never converge.
-LEAST_PRECISION = 1e-5
+MIN_PRECISION = 1e-5
 # Effective number of parameters per expert below which a basis function may be pruned.
-USELESS = 0.05
+USELESS_PARAMETERS = 0.05
 DAMPING_LIMIT = 1e10
 NEWTON_STEPS = 3  # of one fit; the next M-step continues from its result
 # Maximum number of kernels of new softmax gates; number of samples per kernel.
@@ -100,7 +100,7 @@ class SoftmaxGates:
         moved = problem.settled(self.weights, self.precisions)
         updated = problem.settled(moved.weights, moved.better_precisions())
         best = max(same, moved, updated, key=lambda one: one.value)
-        useless = best.determined < USELESS * len(self.weights)
+        useless = best.determined < USELESS_PARAMETERS * len(self.weights)
         useless[0] = False
         kept = np.flatnonzero(~useless)
         basis = self.basis
@@ -147,8 +147,10 @@ class _SoftmaxFit:
     def better_precisions(self) -> Array:
         """Update the precisions by MacKay's fixed point with the hyperprior."""
         determined = np.maximum(self.determined, 0.0)
-        precisions = (determined + 2.0 * SHAPE) / ((self.weights**2).sum(0) + 2.0 * RATE)
-        return np.asarray(np.maximum(precisions, LEAST_PRECISION))
+        precisions = (determined + 2.0 * GAMMA_SHAPE) / (
+            (self.weights**2).sum(0) + 2.0 * GAMMA_RATE
+        )
+        return np.asarray(np.maximum(precisions, MIN_PRECISION))
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +235,11 @@ class _Softmax:
         penalty = -0.5 * float((precisions * weights**2).sum()) - half_log_det
         penalty += 0.5 * experts * float(np.log(precisions).sum())
         # Relative to the mode of the hyperprior, so that pruning a function costs nothing.
-        hyper = SHAPE * np.log(precisions * RATE / SHAPE) - RATE * precisions + SHAPE
+        hyper = (
+            GAMMA_SHAPE * np.log(precisions * GAMMA_RATE / GAMMA_SHAPE)
+            - GAMMA_RATE * precisions
+            + GAMMA_SHAPE
+        )
         penalty += float(hyper.sum())
         inverse = np.linalg.inv(factor)
         variances = (inverse**2).sum(0).reshape(experts, count)

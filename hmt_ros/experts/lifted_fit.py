@@ -27,7 +27,7 @@ from hmt_ros.body.pose_prior import LEARNED, pose_prior, prior_energies
 from hmt_ros.core import elementary
 from hmt_ros.experts.lifter import KeypointHistory, Lifter, landmark_offsets, landmark_rays
 from hmt_ros.image.keypoint_schemes import AUTO, noise_of
-from hmt_ros.image.lifted_poses import HIPS, WHOLE, LiftedPoses
+from hmt_ros.image.lifted_poses import HIPS, WHOLE_BODY_CARRIERS, LiftedPoses
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import minimise
@@ -36,18 +36,18 @@ from hmt_ros.inference.linear_algebra import inverse, product, solve
 from hmt_ros.inference.mixture import GaussianMixture
 
 # Position of the hips until they are placed, camera frame, m.
-AWAY = np.array([0.0, 0.0, 5.0])
+INITIAL_HIPS = np.array([0.0, 0.0, 5.0])
 # Weight of the body's prior, for angles that lifted joints do not determine, such as twists.
 PRIOR_WEIGHT = 0.3
 ITERATIONS, TOLERANCE = 12, 0.05
 # Factor on joint deviations across the line of sight, where keypoints are used directly; scale of
 # the robust kernel of keypoints, in standard deviations.
-ACROSS, KERNEL = 4.0, 4.0
+ACROSS_FACTOR, KERNEL = 4.0, 4.0
 # Standard deviation of a landmark from its keypoint when the person is placed, m at the person.
-SEEN = 0.03
+LANDMARK_SIGMA = 0.03
 # Factors on covariances: for correlated errors of keypoints and joints, and for unknown lengths of
 # the person. Chosen on clips: 90 % regions of single joints cover 88 %, with unknown lengths 80 %.
-TOGETHER, OF_LENGTHS = 4.0, 1.6
+JOINT_COVARIANCE_FACTOR, LENGTH_COVARIANCE_FACTOR = 4.0, 1.6
 # Relative standard deviation of the size of a person.
 KNOWN_SIZE, UNKNOWN_SIZE = 0.02, 0.06
 # Probabilities that a detector exchanges no sides, all sides, only arms or only legs throughout a
@@ -55,7 +55,7 @@ KNOWN_SIZE, UNKNOWN_SIZE = 0.02, 0.06
 # images of some people. Chosen so that 90 % regions of such people have a coverage of 80 %.
 EXCHANGE_SHARES = np.array([0.8, 0.1, 0.05, 0.05])
 # Minimum distance of a person, m.
-NEAREST = 0.4
+MIN_DISTANCE = 0.4
 
 
 def lift_poses(
@@ -133,13 +133,17 @@ def poses_of(
     if not lifted[0].are_whole:
         raise ValueError(
             f'lifted poses with the joints {lifted[0].joints} are not whole, wanted all of '
-            f'{sorted(WHOLE)}'
+            f'{sorted(WHOLE_BODY_CARRIERS)}'
         )
     k = len(lifted[0].log_weights)
     rays, confidences = np.repeat(rays, k, axis=0), np.repeat(confidences, k, axis=0)
     poses, shifts = _placed(body, _postures(body, lifted), rays, confidences)
     poses, covariances = _fitted(body, poses, lifted, rays, confidences)
-    covariances *= TOGETHER if size_spread <= KNOWN_SIZE else TOGETHER * OF_LENGTHS
+    covariances *= (
+        JOINT_COVARIANCE_FACTOR
+        if size_spread <= KNOWN_SIZE
+        else JOINT_COVARIANCE_FACTOR * LENGTH_COVARIANCE_FACTOR
+    )
     size = (size_spread * poses[:, :3, None]) * (size_spread * poses[:, None, :3])
     covariances[:, :3] = covariances[:, :, :3] = 0.0
     covariances[:, :3, :3] = shifts + size
@@ -154,9 +158,11 @@ def poses_of(
 
 
 def _postures(body: Body, lifted: Sequence[LiftedPoses]) -> Array:
-    """Closed-form poses (N K, d) near the lifted means, with the hips at `AWAY`."""
+    """Closed-form poses (N K, d) near the lifted means, with the hips at `INITIAL_HIPS`."""
     skeleton, joints = body.skeleton, lifted[0].joints
-    means = np.concatenate([product(one.sized(skeleton), one.axes) for one in lifted]) + AWAY
+    means = (
+        np.concatenate([product(one.sized(skeleton), one.axes) for one in lifted]) + INITIAL_HIPS
+    )
     place = {name: means[:, j] for j, name in enumerate(joints)}
     return limb_angles(skeleton, place, None)
 
@@ -171,7 +177,11 @@ def _fitted(
     means = np.concatenate([product(one.sized(skeleton), one.axes) for one in lifted])
     means += hips[:, None]
     axes = np.repeat([one.axes for one in lifted], len(lifted[0].log_weights), axis=0)
-    deviations = np.concatenate([one.deviations for one in lifted]) * (ACROSS, ACROSS, 1.0)
+    deviations = np.concatenate([one.deviations for one in lifted]) * (
+        ACROSS_FACTOR,
+        ACROSS_FACTOR,
+        1.0,
+    )
     whiten = axes[:, None] / deviations[..., None]
     carriers, offsets = skeleton.joint_segments[which], skeleton.joint_offsets[which]
     segments, local = _marks(body)
@@ -221,11 +231,11 @@ def _placed(body: Body, poses: Array, rays: Array, confidences: Array) -> tuple[
     rows, wanted = rows.reshape(len(poses), -1, 3), wanted.reshape(len(poses), -1)
     normal = product(rows.transpose(0, 2, 1), rows) + 1e-9 * np.eye(3)
     roots = solve(normal, np.einsum('mri,mr->mi', rows, wanted)[..., None])[..., 0]
-    near = np.maximum(roots[:, 2], max(NEAREST, 1.05 * float(body.lower[2])))
+    near = np.maximum(roots[:, 2], max(MIN_DISTANCE, 1.05 * float(body.lower[2])))
     roots *= (near / np.maximum(roots[:, 2], 1e-3))[:, None]
     result = poses.copy()
     result[:, :3] = np.clip(roots, body.lower[:3], body.upper[:3])
-    return result, np.asarray(SEEN**2 * inverse(normal))
+    return result, np.asarray(LANDMARK_SIGMA**2 * inverse(normal))
 
 
 def _marks(body: Body) -> tuple[Index, Array]:

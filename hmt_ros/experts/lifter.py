@@ -10,11 +10,11 @@ with simulated cameras and detector errors (`keypoint_training`).
     keypoints -> landmarks of all schemes -> rays -> the view of a camera that looks at the trunk
 
 A window has one slot for each of `TIMES`, relative to the image of the estimate. The nearest image
-fills the slot if its time differs by at most `NEAR`, so any frame rate works. The inputs are the
-positions of the landmarks in the plane of a camera that looks at the trunk, divided by their
-extent, with confidences; the time offset of each image from its slot; the extent; and, if known,
-the direction against gravity in that camera and the proportions of the person. If gravity is known,
-that camera is rolled upright, because the experts were trained on upright cameras only.
+fills the slot if its time differs by at most `TIME_TOLERANCES`, so any frame rate works. The inputs
+are the positions of the landmarks in the plane of a camera that looks at the trunk, divided by
+their extent, with confidences; the time offset of each image from its slot; the extent; and, if
+known, the direction against gravity in that camera and the proportions of the person. If gravity is
+known, that camera is rolled upright, because the experts were trained on upright cameras only.
 """
 
 from __future__ import annotations
@@ -46,7 +46,12 @@ from hmt_ros.experts.gates import log_softmax
 from hmt_ros.experts.network_experts import Floats, Layers
 from hmt_ros.experts.pose_encoding import ray_rotations
 from hmt_ros.image.keypoint_schemes import AUTO, landmarks, landmarks_of, position_deviations
-from hmt_ros.image.lifted_poses import WHOLE, LiftedPoses, bone_lengths, from_positions
+from hmt_ros.image.lifted_poses import (
+    WHOLE_BODY_CARRIERS,
+    LiftedPoses,
+    bone_lengths,
+    from_positions,
+)
 from hmt_ros.image.terms.keypoints import (
     ARMS,
     CENTRE,
@@ -62,7 +67,7 @@ from hmt_ros.inference.random_numbers import standard_normals
 
 # Slot times of a window relative to its image, s, and maximum offset of an image from each, s.
 TIMES = np.array([0.0, -0.067, -0.15, -0.3, -0.5, -0.8, 0.067, 0.15, 0.3, 0.5, 0.8])
-NEAR = np.array([0.02, *([0.045, 0.06, 0.09, 0.12, 0.17] * 2)])
+TIME_TOLERANCES = np.array([0.02, *([0.045, 0.06, 0.09, 0.12, 0.17] * 2)])
 
 _SIDED = ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle', 'heel', 'toe')
 LANDMARKS = (
@@ -75,7 +80,7 @@ LANDMARKS = (
     'centre_of_head',
 )
 # Landmark that replaces each joint centre of other keypoint schemes.
-INSTEAD = {
+SUBSTITUTES = {
     **{
         f'centre_of_{side}_{name}': f'{side}_{name}'
         for name in ('shoulder', 'hip')
@@ -93,7 +98,7 @@ TRUNK = np.array(
 # Landmarks of body joints, for keypoints that are named after joints.
 OF_JOINTS = {'pelvis': 'mid_hip', 'neck': 'neck_base', 'head': 'centre_of_head'}
 # Lengths whose proportions are inputs; the rise of the shoulders is not among them.
-PROPORTIONED = (
+PROPORTION_LENGTHS = (
     'thigh',
     'shin',
     'foot',
@@ -107,13 +112,13 @@ PROPORTIONED = (
     'neck_to_head',
 )
 # Minimum ratio of a length to the usual one; smaller ratios are clipped.
-SHORTEST = 0.3
+MIN_LENGTH_RATIO = 0.3
 # Maximum number of components of a mixture over exchanges of sides.
-MOST = 12
+MAX_COMPONENTS = 12
 # Minimum confidence of a keypoint that is used; minimum number of landmarks of a person.
-LEAST_CONFIDENCE, FEWEST = 0.02, 5
+MIN_CONFIDENCE, MIN_LANDMARKS = 0.02, 5
 # Number of inputs of a window.
-INPUTS = len(TIMES) * (3 * len(LANDMARKS) + 2) + 5 + len(PROPORTIONED) + 1
+INPUTS = len(TIMES) * (3 * len(LANDMARKS) + 2) + 5 + len(PROPORTION_LENGTHS) + 1
 # Landmark (E, L) that each landmark becomes under each exchange in `terms.keypoints.EXCHANGED`.
 _ARM, _LEG = ('shoulder', 'elbow', 'wrist'), ('hip', 'knee', 'ankle', 'heel', 'toe')
 _GROUPS = [ARMS if x.endswith(_ARM) else LEGS if x.endswith(_LEG) else CENTRE for x in LANDMARKS]
@@ -148,13 +153,15 @@ def log_ratios(usual: Body, lengths: Mapping[str, float]) -> Array:
     """
     own = usual.segment_lengths
     return np.asarray(
-        elementary.log([max(lengths[name] / own[name], SHORTEST) for name in PROPORTIONED])
+        elementary.log(
+            [max(lengths[name] / own[name], MIN_LENGTH_RATIO) for name in PROPORTION_LENGTHS]
+        )
     )
 
 
 def relative(usual: Body, logs: Array) -> Array:
     """Subtract from log ratios (..., P) their weighted mean, which is the person's size."""
-    weights = np.array([usual.segment_lengths[name] for name in PROPORTIONED])
+    weights = np.array([usual.segment_lengths[name] for name in PROPORTION_LENGTHS])
     return np.asarray(logs - product(logs, weights)[..., None] / weights.sum())
 
 
@@ -180,7 +187,7 @@ def places_of(keypoints: Keypoints, scheme: str = AUTO) -> list[int]:
     result = []
     for name, landmark in zip(keypoints.names, called, strict=True):
         found = landmark or OF_JOINTS.get(name, name)
-        found = INSTEAD.get(found, found)
+        found = SUBSTITUTES.get(found, found)
         result.append(LANDMARKS.index(found) if found in LANDMARKS else -1)
     return result
 
@@ -213,7 +220,7 @@ def filled(
     nearer = np.abs(stamps[right] - wanted) < np.abs(stamps[left] - wanted)
     rows = np.where(nearer, right, left)
     times = stamps[rows] - at[:, None]
-    there = np.abs(times - TIMES) <= NEAR
+    there = np.abs(times - TIMES) <= TIME_TOLERANCES
     if causal:
         there &= times <= 1e-6
     return rows, there, times
@@ -230,22 +237,20 @@ def window_inputs(
         confidences: (N, S, L) confidences from 0 (not seen) to 1.
         times: (N, S) times of the images relative to that of the window, s.
         ups: (N, 3) unit vectors against gravity, camera frame; 0: unknown.
-        persons: (N, len(PROPORTIONED)) proportions of the persons; 0: unknown.
+        persons: (N, len(PROPORTION_LENGTHS)) proportions of the persons; 0: unknown.
     """
     rays, confidences, times, ups, persons = (
         np.ascontiguousarray(x, dtype=np.float64) for x in (rays, confidences, times, ups, persons)
     )
     middles = np.empty((len(rays), 3))
-    window_middles(rays, confidences, TRUNK, LEAST_CONFIDENCE, middles)
+    window_middles(rays, confidences, TRUNK, MIN_CONFIDENCE, middles)
     level = roll(ups)
     upright = ray_rotations(product(middles[:, None], level)[:, 0]).transpose(0, 2, 1)
     axes = product(upright, level.transpose(0, 2, 1))
     values = np.empty((len(rays), INPUTS), dtype=np.float32)
-    fill_window_inputs(
-        rays, confidences, times, TIMES, ups, persons, axes, LEAST_CONFIDENCE, values
-    )
-    seen = (confidences[:, 0] >= LEAST_CONFIDENCE).sum(1)
-    return WindowInputs(values, axes, seen >= FEWEST)
+    fill_window_inputs(rays, confidences, times, TIMES, ups, persons, axes, MIN_CONFIDENCE, values)
+    seen = (confidences[:, 0] >= MIN_CONFIDENCE).sum(1)
+    return WindowInputs(values, axes, seen >= MIN_LANDMARKS)
 
 
 def _exchanged_inputs(order: Index) -> Index:
@@ -263,9 +268,9 @@ SHIPPED = 'keypoints'
 KIND = 'lifter'
 
 # Earliest time in a window, relative to its image, s; minimum z of unit rays as a divisor.
-EARLIEST, BEFORE = float((TIMES - NEAR).min()), 0.1
+EARLIEST_TIME, MIN_RAY_DEPTH = float((TIMES - TIME_TOLERANCES).min()), 0.1
 # Standard deviation above which a keypoint is ignored, m at the person.
-ANYWHERE = 0.15
+USELESS_SIGMA = 0.15
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -290,8 +295,8 @@ class Network(Layers):
         k = out.shape[1] // (1 + 6 * j)
         gates, means = out[:, :k], out[:, k : k * (1 + 3 * j)].reshape(n, k, j, 3)
         spreads = out[:, k * (1 + 3 * j) :].reshape(n, k, j, 3)
-        deviations = elementary.exp(np.clip(spreads + SPREAD, *SPREADS))
-        return log_softmax(gates), MEANS * means + self.middle, deviations
+        deviations = elementary.exp(np.clip(spreads + USUAL_LOG_SIGMA, *LOG_SIGMA_LIMITS))
+        return log_softmax(gates), MEAN_SCALE * means + self.middle, deviations
 
     def whitened(self, inputs: Floats) -> Floats:
         """Return inputs (N, p) with zero mean and unit scale, for the layers."""
@@ -299,7 +304,7 @@ class Network(Layers):
 
 
 # Scale of the means, m; log of the usual deviation, and limits of log deviations, log m.
-MEANS, SPREAD, SPREADS = 0.3, -2.5, (-5.0, 1.0)
+MEAN_SCALE, USUAL_LOG_SIGMA, LOG_SIGMA_LIMITS = 0.3, -2.5, (-5.0, 1.0)
 
 
 class Lifter:
@@ -324,7 +329,7 @@ class Lifter:
     def proportions(self, body: Body) -> Array | None:
         """Return a person's proportions for a window, or None if the body lacks some lengths."""
         lengths = body.segment_lengths
-        known = lengths.keys() >= {*PROPORTIONED}
+        known = lengths.keys() >= {*PROPORTION_LENGTHS}
         return proportions(self.usual, lengths) if known else None
 
     def lift(
@@ -352,8 +357,8 @@ class Lifter:
             ups: (N, 3) unit vectors against gravity, camera frame; None: unknown.
             person: proportions of the person; None: unknown.
             causal: whether each estimate ignores later images.
-            exchanges: (E,) probabilities of `EXCHANGES`; the `MOST` heaviest components are kept.
-                None: the sides of the keypoints are correct.
+            exchanges: (E,) probabilities of `EXCHANGES`; the `MAX_COMPONENTS` heaviest components
+                are kept. None: the sides of the keypoints are correct.
         """
         rows, there, times = filled(stamps, at, causal=causal)
         n = len(at)
@@ -362,7 +367,7 @@ class Lifter:
             confidences[rows] * there[..., None],
             times,
             np.zeros((n, 3)) if ups is None else ups,
-            np.zeros((n, len(PROPORTIONED))) if person is None else np.tile(person, (n, 1)),
+            np.zeros((n, len(PROPORTION_LENGTHS))) if person is None else np.tile(person, (n, 1)),
         )
         result: list[LiftedPoses | None] = [None] * n
         seen = np.flatnonzero(inputs.known)
@@ -382,7 +387,7 @@ class Lifter:
         found = self.network(inputs[:, EXCHANGED_INPUTS].reshape(-1, INPUTS))
         gates, means, deviations = (x.reshape(n, -1, *x.shape[2:]) for x in found)
         gates = gates + np.repeat(elementary.log(exchanges), gates.shape[1] // len(exchanges))
-        kept = np.arange(n)[:, None], np.argsort(-gates, axis=1, kind='stable')[:, :MOST]
+        kept = np.arange(n)[:, None], np.argsort(-gates, axis=1, kind='stable')[:, :MAX_COMPONENTS]
         return log_softmax(gates[kept]), means[kept], deviations[kept]
 
     def to_arrays(self) -> Arrays:
@@ -406,7 +411,7 @@ class Lifter:
         windows = parameters['landmarks'], parameters['times']
         require(windows == (list(LANDMARKS), TIMES.tolist()), 'it has learned other windows')
         joints = tuple(map(str, parameters['joints']))
-        whole = len({*joints}) == len(joints) and {*joints} >= WHOLE
+        whole = len({*joints}) == len(joints) and {*joints} >= WHOLE_BODY_CARRIERS
         require(whole, 'its joints are not those of a whole pose')
         network = Network.from_arrays(arrays, INPUTS)
         sizes = network.mean.shape, network.scale.shape
@@ -469,7 +474,7 @@ class KeypointHistory:
             stamp: time of the image, s; later than all previous times.
         """
         rays, confidences = landmark_rays(self._camera, keypoints)
-        recent = [one for one in self._seen if one[0] >= stamp + EARLIEST]
+        recent = [one for one in self._seen if one[0] >= stamp + EARLIEST_TIME]
         self._seen = [*recent, (stamp, rays, confidences)]
         return rays, confidences
 
@@ -477,7 +482,7 @@ class KeypointHistory:
         """Rotate the history by `rotation` (3, 3) into the frame of a camera that has turned."""
         for i, (stamp, rays, confidences) in enumerate(self._seen):
             turned = product(np.concatenate([rays, np.ones((len(rays), 1))], axis=1), rotation.T)
-            turned = turned[:, :2] / np.maximum(turned[:, 2:], BEFORE)
+            turned = turned[:, :2] / np.maximum(turned[:, 2:], MIN_RAY_DEPTH)
             self._seen[i] = stamp, turned, confidences
 
     def lift(
@@ -509,10 +514,10 @@ def landmark_rays(camera: Camera, keypoints: Keypoints, scheme: str = AUTO) -> t
     shown = np.flatnonzero(keypoints.seen & (places >= 0))
     if len(shown):
         found = camera.rays(keypoints.pixels[shown])
-        rays[places[shown]] = found[:, :2] / np.maximum(found[:, 2:], BEFORE)
+        rays[places[shown]] = found[:, :2] / np.maximum(found[:, 2:], MIN_RAY_DEPTH)
         # A keypoint with a large covariance carries no information, however confident it is.
         sigma = np.sqrt(0.5 * np.trace(keypoints.covariances[shown], axis1=1, axis2=2))
-        known = ~(sigma > ANYWHERE * keypoints.magnification())
+        known = ~(sigma > USELESS_SIGMA * keypoints.magnification())
         confidences[places[shown]] = np.where(known, keypoints.confidences[shown], 0.0)
     return rays, confidences
 

@@ -36,16 +36,16 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-BATCH = 256  # number of inputs whose neighbours are searched together
+BATCH_SIZE = 256  # number of inputs whose neighbours are searched together
 RIDGE = 1e-6  # share of the targets' variance added to the covariance
 # Minimum distance relative to the spacing, so that no single neighbour gets all the weight.
-CLOSEST = 1e-3
+MIN_RELATIVE_DISTANCE = 1e-3
 # Minimum spacing of samples, in scaled inputs, because samples may coincide.
-LEAST_SPACING = 1e-9
-SWEEPS = 8  # maximum number of iterations of the clustering
-LEFT_OUT = 600  # number of training samples for the covariance of local experts
-FAINT = 1e-12  # weight of an expert without neighbours
-MOST = 1000  # maximum number of neighbours, and of experts, in a file
+MIN_SPACING = 1e-9
+MAX_SWEEPS = 8  # maximum number of iterations of the clustering
+LEFT_OUT_SAMPLES = 600  # number of training samples for the covariance of local experts
+EMPTY_WEIGHT = 1e-12  # weight of an expert without neighbours
+MAX_NEIGHBOURS = 1000  # maximum number of neighbours, and of experts, in a file
 
 
 class _NeighbourModel(ConditionalDensity):
@@ -92,15 +92,15 @@ class _NeighbourModel(ConditionalDensity):
         All distances are computed: in the high dimension of descriptors, no tree is faster.
         """
         distances, rows = np.empty((len(points), count)), np.empty((len(points), count), np.intp)
-        for i in range(0, len(points), BATCH):
-            some = points[i : i + BATCH]
+        for i in range(0, len(points), BATCH_SIZE):
+            some = points[i : i + BATCH_SIZE]
             squared = self._norms - product(self._scaled, 2.0 * some.T).T
             index = smallest_columns(squared, count)
             squared = np.take_along_axis(squared, index, axis=1) + (some * some).sum(1)[:, None]
             order = np.argsort(squared, axis=1, kind='stable')
             squared = np.take_along_axis(squared, order, axis=1)
-            distances[i : i + BATCH] = np.sqrt(np.maximum(squared, 0.0))
-            rows[i : i + BATCH] = np.take_along_axis(index, order, axis=1)
+            distances[i : i + BATCH_SIZE] = np.sqrt(np.maximum(squared, 0.0))
+            rows[i : i + BATCH_SIZE] = np.take_along_axis(index, order, axis=1)
         return distances, rows
 
     def _learned(self) -> Arrays:
@@ -124,8 +124,10 @@ class _NeighbourModel(ConditionalDensity):
         require(n == len(targets) == len(weights), 'samples do not pair')
         check_positive('weights and spacing', np.append(weights, arrays['spacing']))
         experts, nearest = (vars(self).get(x, 1) for x in ('n_experts', 'width_neighbour'))
-        right = 1 <= nearest <= count <= min(n, MOST) and 1 <= experts <= MOST
-        require(right, f'wanted 1 to {MOST} experts and neighbours, and no more than samples')
+        right = 1 <= nearest <= count <= min(n, MAX_NEIGHBOURS) and 1 <= experts <= MAX_NEIGHBOURS
+        require(
+            right, f'wanted 1 to {MAX_NEIGHBOURS} experts and neighbours, and no more than samples'
+        )
         scale = Standardisation(arrays['centre'], arrays['scale'])
         self._keep(TrainingPairs(inputs, targets, weights), scale)
         self.noise_ = np.asarray(arrays['noise'], dtype=np.float64)
@@ -168,7 +170,7 @@ class NearestNeighbours(_NeighbourModel):
         own[~own.any(1), -1] = True
         shape = (len(pairs), self.n_neighbours)
         distances, index = distances[~own].reshape(shape), index[~own].reshape(shape)
-        self.spacing_ = max(float(np.sqrt((distances**2).mean())), LEAST_SPACING)
+        self.spacing_ = max(float(np.sqrt((distances**2).mean())), MIN_SPACING)
         residuals = pairs.targets[:, None] - pairs.targets[index]
         share = self._shares(distances, index) * (pairs.weights / pairs.weights.sum())[:, None]
         self.noise_ = ridge + np.einsum(
@@ -194,7 +196,7 @@ class NearestNeighbours(_NeighbourModel):
         return np.asarray(elementary.exp(-0.5 * (distances[:, 0] / self.spacing_) ** 2))
 
     def _shares(self, distances: Array, index: Index) -> Array:
-        closeness = 1.0 / np.maximum(distances, CLOSEST * self.spacing_)
+        closeness = 1.0 / np.maximum(distances, MIN_RELATIVE_DISTANCE * self.spacing_)
         closeness *= self.sample_weight_[index]
         return np.asarray(closeness / closeness.sum(1, keepdims=True))
 
@@ -249,12 +251,12 @@ class LocalExperts(_NeighbourModel):
         )
         ridge = self._keep_pairs(pairs)
         rng = np.random.default_rng(self.seed)
-        left_out = np.sort(rng.permutation(len(pairs))[:LEFT_OUT])
+        left_out = np.sort(rng.permutation(len(pairs))[:LEFT_OUT_SAMPLES])
         distances, index = self._nearest(self._scaled[left_out], self.n_neighbours + 1)
-        self.spacing_ = max(float(np.sqrt((distances[:, 1] ** 2).mean())), LEAST_SPACING)
+        self.spacing_ = max(float(np.sqrt((distances[:, 1] ** 2).mean())), MIN_SPACING)
         weights, means = self._modes(distances[:, 1:], index[:, 1:])[:2]
         residuals = pairs.targets[left_out][:, None] - means
-        squared = np.where(weights > FAINT, (residuals**2).sum(2), np.inf)
+        squared = np.where(weights > EMPTY_WEIGHT, (residuals**2).sum(2), np.inf)
         nearest = residuals[np.arange(len(residuals)), squared.argmin(1)]
         share = pairs.weights[left_out] / pairs.weights[left_out].sum()
         self.noise_ = ridge + product(share * nearest.T, nearest)
@@ -312,7 +314,7 @@ class LocalExperts(_NeighbourModel):
             owner[closer] = m
             nearest = np.where(closer, between[rows, chosen], nearest)
         experts = np.arange(self.n_experts)[:, None]
-        for _ in range(SWEEPS):
+        for _ in range(MAX_SWEEPS):
             member = (owner[:, None] == experts) * kernel[:, None]
             total = member.sum(2)
             means = product(member, targets) / np.maximum(total, 1e-300)[..., None]
@@ -330,7 +332,7 @@ class LocalExperts(_NeighbourModel):
         heaviest = total.argmax(1)
         member = np.where(empty[..., None], member[rows, heaviest][:, None], member)
         shares = member / member.sum(2, keepdims=True)
-        weights = np.where(empty, FAINT, total)
+        weights = np.where(empty, EMPTY_WEIGHT, total)
         order = np.argsort(-weights, axis=1, kind='stable')
         weights = np.take_along_axis(weights, order, axis=1)
         shares = np.take_along_axis(shares, order[..., None], axis=1)

@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 # Maximum of |log sqrt(c)|.
-WIDTHS = 2.0
-LEAK = 0.1  # slope of a unit below 0
+LOG_WIDTH_LIMIT = 2.0
+LEAK_SLOPE = 0.1  # slope of a unit below 0
 # Limits of a file: number of layers, size of whitened inputs, and size of the outputs for these.
-MOST_LAYERS, LARGEST_INPUT, LARGEST_OUTPUT = 100, np.float32(100.0), 1e15
+MAX_LAYERS, MAX_INPUT, MAX_OUTPUT = 100, np.float32(100.0), 1e15
 
 Floats = NDArray[np.float32]
 
@@ -95,11 +95,11 @@ class Layers:
         """
         own = {name: np.asarray(arrays[name], np.float32) for name in cls.__dataclass_fields__}
         m = len(own['hidden'])
-        require(m <= MOST_LAYERS, f'it has {m} hidden layers, wanted at most {MOST_LAYERS}')
+        require(m <= MAX_LAYERS, f'it has {m} hidden layers, wanted at most {MAX_LAYERS}')
         # The network of absolute weights, at the largest inputs, bounds all outputs.
         bound = cls(**{name: np.abs(values) for name, values in own.items()})
-        largest = bound.outputs(np.full((1, p), LARGEST_INPUT)).max()
-        require(largest <= LARGEST_OUTPUT, f'its outputs may be larger than {LARGEST_OUTPUT:g}')
+        largest = bound.outputs(np.full((1, p), MAX_INPUT)).max()
+        require(largest <= MAX_OUTPUT, f'its outputs may be larger than {MAX_OUTPUT:g}')
         return cls(**own)
 
 
@@ -167,7 +167,7 @@ class NetworkExperts(ConditionalDensity):
         return Components(
             log_softmax(gates),
             means * of_targets.scale + of_targets.centre,
-            elementary.exp(2.0 * np.clip(widths, -WIDTHS, WIDTHS)),
+            elementary.exp(2.0 * np.clip(widths, -LOG_WIDTH_LIMIT, LOG_WIDTH_LIMIT)),
             self.noise_,
         )
 
@@ -217,8 +217,8 @@ def read_outputs(out: Any, m: int, d: int) -> tuple[Any, Any, Any]:
 
 def _leaky(x: Floats) -> Floats:
     """Outputs of leaky units."""
-    return np.asarray(np.maximum(x, np.float32(LEAK) * x))
+    return np.asarray(np.maximum(x, np.float32(LEAK_SLOPE) * x))
 
 
 def _slopes(x: Floats) -> Floats:
-    return np.where(x > 0, np.float32(1.0), np.float32(LEAK))
+    return np.where(x > 0, np.float32(1.0), np.float32(LEAK_SLOPE))

@@ -27,10 +27,12 @@ ROOT = ('root_tx', 'root_ty', 'root_tz')
 TURNS = ('root_z', 'root_y', 'root_x')
 # Minimum length of an axis in derivatives. The mean over opposite headings is a short vector, and
 # its direction carries little information.
-SHORTEST = 0.1
+MIN_AXIS_LENGTH = 0.1
 # Next and previous coordinate of each one, cyclically.
-NEXT, LAST = [1, 2, 0], [2, 0, 1]
-STEEPEST = np.radians(86.0)  # limit of the middle root angle; at 90 degrees the other axes align
+NEXT_AXIS, PREVIOUS_AXIS = [1, 2, 0], [2, 0, 1]
+MAX_MIDDLE_ANGLE = np.radians(
+    86.0
+)  # limit of the middle root angle; at 90 degrees the other axes align
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +100,7 @@ class PoseEncoding:
         poses = self.decode(targets, roots)
         # From a small rotation to root angles: the inverse of the matrix of their axes.
         axes = forward(self.body.skeleton, poses).axes[3:AXES].transpose(2, 1, 0)  # (N, 3, angle)
-        from_rotation = pseudo_inverse(axes, float(elementary.cos(STEEPEST)) / 2)
+        from_rotation = pseudo_inverse(axes, float(elementary.cos(MAX_MIDDLE_ANGLE)) / 2)
         by_target, by_root = np.zeros((n, d, d)), np.zeros((n, d, 3))
         to_camera = self._from_view(roots)
         by_target[:, 3:AXES, :AXES] = product(
@@ -206,13 +208,13 @@ def _rotation_by_axes(axes: Array) -> Array:
     result = np.empty((len(axes), 3, AXES))
     eye = np.eye(3)
     across = eye - y[:, :, None] * y[:, None, :]
-    dy = across / np.maximum(np.linalg.norm(front, axis=1), SHORTEST)[:, None, None]
+    dy = across / np.maximum(np.linalg.norm(front, axis=1), MIN_AXIS_LENGTH)[:, None, None]
     along = (up * y).sum(1)[:, None, None]
     rest = np.linalg.norm(up - along[:, :, 0] * y, axis=1)
     # d(up - (up y) y) with respect to the front axis, through y, and to the up axis.
     by_front = -(y[:, :, None] * product(up[:, None, :], dy)) - along * dy
     flat = eye - z[:, :, None] * z[:, None, :]
-    flat /= np.maximum(rest, SHORTEST)[:, None, None]
+    flat /= np.maximum(rest, MIN_AXIS_LENGTH)[:, None, None]
     dz = [product(flat, by_front), product(flat, across)]
     dys = [dy, np.zeros_like(dy)]
     x = frame[:, :, 0]
@@ -228,7 +230,9 @@ def _rotation_by_axes(axes: Array) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """Cross products (..., 3); four times as fast as numpy's for few vectors."""
-    return np.asarray(a[..., NEXT] * b[..., LAST] - a[..., LAST] * b[..., NEXT])
+    return np.asarray(
+        a[..., NEXT_AXIS] * b[..., PREVIOUS_AXIS] - a[..., PREVIOUS_AXIS] * b[..., NEXT_AXIS]
+    )
 
 
 def _unit(vectors: Array) -> Array:

@@ -38,12 +38,12 @@ from hmt_ros.experts.conditional_density import ConditionalDensity, stored_model
 from hmt_ros.experts.density_propagation import joined, propagate
 from hmt_ros.experts.descriptor.contour import PersonBlob, centred_view, person_blob
 from hmt_ros.experts.descriptor.silhouette_descriptor import (
-    ANGULAR,
-    FIXED,
-    MAP,
+    ANGULAR_BINS,
+    FIXED_FEATURES,
+    MAP_SIDE,
     MOMENTS,
     PAIR_BINS,
-    RADIAL,
+    RADIAL_BINS,
     SilhouetteDescriptor,
     SilhouetteParts,
     silhouette_parts,
@@ -65,18 +65,18 @@ SHIPPED = 'silhouettes'
 
 KIND = 'pose_predictor'
 MAX_COMPONENTS = 8
-LIGHTEST = 1e-3  # weight below which a component is dropped
+MIN_WEIGHT = 1e-3  # weight below which a component is dropped
 # Rate of the training sequences of rule (1), Hz, and their time step, s.
 RATE = 30.0
 STEP = 1.0 / RATE
-JITTER = 1e-9  # variance added to each coordinate of poses, m^2 and rad^2
+ADDED_VARIANCE = 1e-9  # variance added to each coordinate of poses, m^2 and rad^2
 # Ways to propagate a mixture: by rule (1), or not at all.
-BY_EXPERTS, ALONE = 'experts', 'none'
-PROPAGATIONS = (BY_EXPERTS, ALONE)
+BY_EXPERTS, WITHOUT_PROPAGATION = 'experts', 'none'
+PROPAGATIONS = (BY_EXPERTS, WITHOUT_PROPAGATION)
 # Rate at which the past is discarded, 1/s, so that a lost track recovers. Chosen by hand.
-FORGETTING = 5.0
+FORGETTING_RATE = 5.0
 # Maximum condition number of a target basis; maximum deviation of a short length from usual, m.
-WORST_CONDITION, OFFSET = 1e12, 0.06
+MAX_CONDITION, MAX_OFFSET = 1e12, 0.06
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ class PosePredictor:
         right = (len(equilibrium), equilibrium.dimension) == (1, size)
         require(right, f'equilibrium must be one component over {size} numbers')
         sizes = singular_values(target_basis)[1]
-        require(sizes[0] <= WORST_CONDITION * sizes[-1], 'target_basis is singular')
+        require(sizes[0] <= MAX_CONDITION * sizes[-1], 'target_basis is singular')
         self._from_basis = np.asarray(inverse(target_basis), dtype=np.float64)
 
     @property
@@ -174,7 +174,7 @@ class PosePredictor:
         previous: GaussianMixture | None = None,
         interval: float = STEP,
         *,
-        propagation: str = ALONE,
+        propagation: str = WITHOUT_PROPAGATION,
         max_components: int = MAX_COMPONENTS,
         size_spread: float = SIZE_SPREAD,
         image: Image | None = None,
@@ -220,7 +220,7 @@ class PosePredictor:
         means, covariances = placed_gaussians(
             self.encoding, targets.means, targets.covariances, placement
         )
-        covariances += JITTER * np.eye(self.encoding.size)
+        covariances += ADDED_VARIANCE * np.eye(self.encoding.size)
         mixture = GaussianMixture(targets.weights, means, covariances)
         return Prediction(mixture, blob, support)
 
@@ -239,7 +239,7 @@ class PosePredictor:
         previous: GaussianMixture | None = None,
         interval: float = STEP,
         *,
-        propagation: str = ALONE,
+        propagation: str = WITHOUT_PROPAGATION,
         max_components: int = MAX_COMPONENTS,
     ) -> GaussianMixture:
         """Predict the mixture over targets (D,) for one descriptor, heaviest component first.
@@ -252,9 +252,9 @@ class PosePredictor:
         """
         row = np.asarray(descriptor, dtype=np.float64)
         found = _heaviest(self.model.predict(row[None])[0], max_components)
-        if previous is None or propagation == ALONE:
+        if previous is None or propagation == WITHOUT_PROPAGATION:
             return _transformed(found, self._from_basis)
-        forgotten = -float(elementary.expm1(-FORGETTING * interval))
+        forgotten = -float(elementary.expm1(-FORGETTING_RATE * interval))
         if propagation != BY_EXPERTS:
             raise ValueError(f'no propagation {propagation!r}, wanted one of {PROPAGATIONS}')
         if self.dynamics is None:
@@ -296,7 +296,7 @@ class PosePredictor:
         slopes = self.encoding.encoding_jacobians(poses.means)
         covariances = product(product(slopes, poses.covariances), slopes.transpose(0, 2, 1))
         # Unit vectors have no variance along themselves, so the covariance would be singular.
-        covariances += JITTER * np.eye(self.encoding.size)
+        covariances += ADDED_VARIANCE * np.eye(self.encoding.size)
         return GaussianMixture(poses.weights, self.encoding.encode(poses.means), covariances)
 
     def to_arrays(self) -> Arrays:
@@ -331,7 +331,7 @@ class PosePredictor:
             body, own = body_of(parameters), parameters['lengths']
             usual = body.segment_lengths
             # Some lengths are offsets near zero, of either sign.
-            allowed = {k: 0.9 * x if x > OFFSET else OFFSET for k, x in usual.items()}
+            allowed = {k: 0.9 * x if x > MAX_OFFSET else MAX_OFFSET for k, x in usual.items()}
             human = all(abs(own[k] - x) <= allowed[k] for k, x in usual.items())
             require(human and own.keys() == usual.keys(), 'nobody has its lengths')
             body = body.with_segment_lengths(own)
@@ -356,8 +356,10 @@ class PosePredictor:
 
     def answer(self, given: Array) -> GaussianMixture:
         """Mixture over targets (D,) from silhouette parts; uses the dynamics if available."""
-        contexts, *others = np.split(given, np.cumsum([-FIXED, PAIR_BINS, MAP * MAP, MOMENTS]))
-        parts = SilhouetteParts(contexts.reshape(-1, RADIAL * ANGULAR), *others)
+        contexts, *others = np.split(
+            given, np.cumsum([-FIXED_FEATURES, PAIR_BINS, MAP_SIDE * MAP_SIDE, MOMENTS])
+        )
+        parts = SilhouetteParts(contexts.reshape(-1, RADIAL_BINS * ANGULAR_BINS), *others)
         row = self.descriptor.describe([parts])[0]
         found = self.model.answer(row)
         if self.dynamics is not None:
@@ -368,7 +370,7 @@ class PosePredictor:
         """Write the predictor to an .npz file, with its notes as the card, and return its path."""
         read = partial(self.from_arrays, body=self.body)
         # Random numbers from 0 to 1, because most values of silhouette parts are.
-        size = self.descriptor.points * RADIAL * ANGULAR + FIXED
+        size = self.descriptor.points * RADIAL_BINS * ANGULAR_BINS + FIXED_FEATURES
         example = np.random.default_rng(0).integers(0, 64, size) / 64.0
         return write_model(path, self, read, self.notes, example)
 
@@ -421,7 +423,7 @@ def _check_fit(what: str, model: ConditionalDensity, inputs: int, outputs: int) 
 def _heaviest(mixture: GaussianMixture, count: int) -> GaussianMixture:
     """Return the heaviest components, normalised."""
     ordered = mixture.normalised().sorted()
-    kept = max(int((ordered.weights >= LIGHTEST).sum()), 1)
+    kept = max(int((ordered.weights >= MIN_WEIGHT).sum()), 1)
     return ordered[: min(kept, count)].normalised()
 
 

@@ -37,13 +37,13 @@ SIZE_SPREAD = 0.06  # relative standard deviation of the size of persons
 CUT_SPREAD = 0.15  # additional deviation for a person who is cut by the border
 # Standard deviations of a side of the box: from the outline, px; and from hair, clothes and shoes,
 # relative to the longer side of the box.
-OUTLINE_SIGMA, CLOTHES = 1.5, 0.02
+OUTLINE_SIGMA, CLOTHES_SIGMA = 1.5, 0.02
 # Prior standard deviations along and across the line of sight, relative to the distance.
 DEPTH_SPREAD, ACROSS_SPREAD = 0.7, 1.0
-STEPS = 10
+MAX_STEPS = 10
 # Step lengths relative to the depth: iterations end below the first; derivatives of the encoding
 # are recomputed above the second; the third is the maximum.
-DONE, TURNED, LONGEST_STEP = 1e-3, 0.05, 0.4
+STEP_TOLERANCE, RELINEARISATION_STEP, MAX_STEP = 1e-3, 0.05, 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ def place_roots(
     mesh = _mesh(body)
     sides = np.array(place.box)
     cut = np.array(place.cut)
-    noise = OUTLINE_SIGMA**2 + (CLOTHES * max(sides[2] - sides[0], sides[3] - sides[1])) ** 2
+    noise = OUTLINE_SIGMA**2 + (CLOTHES_SIGMA * max(sides[2] - sides[0], sides[3] - sides[1])) ** 2
     roots = _first_roots(encoding, camera, sides, targets)
     start, prior = roots.copy(), _prior(roots)
     nearest = 1.05 * body.lower[2]
@@ -105,18 +105,18 @@ def place_roots(
         return residual, by_root, by_target, solve(spread, by_root).transpose(0, 2, 1)
 
     slopes = encoding.jacobians(targets, roots)
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         residual, by_root, _, weighted = linearised(slopes)
         pull = product(weighted, residual[..., None]) + product(prior, (roots - start)[..., None])
         step = -solve(product(weighted, by_root) + prior, pull)[..., 0]
         depth = roots[:, 2]
         share = np.linalg.norm(step, axis=1) / depth
-        step *= np.minimum(1.0, LONGEST_STEP / np.maximum(share, 1e-12))[:, None]
+        step *= np.minimum(1.0, MAX_STEP / np.maximum(share, 1e-12))[:, None]
         roots = roots + step
         roots[:, 2] = np.maximum(roots[:, 2], nearest)
-        if share.max() < DONE:
+        if share.max() < STEP_TOLERANCE:
             break
-        if share.max() > TURNED:
+        if share.max() > RELINEARISATION_STEP:
             slopes = encoding.jacobians(targets, roots)
     slopes = encoding.jacobians(targets, roots)
     _, by_root, by_target, weighted = linearised(slopes)

@@ -25,13 +25,13 @@ import numpy as np
 from hmt_ros.inference.arrays import Array, Index
 
 # Unexplained share of a candidate, given the active functions, below which it is not added.
-INDEPENDENT = 1e-8
+MIN_UNEXPLAINED_SHARE = 1e-8
 # Relative squared difference below which two functions count as equal.
-ALIGNED = 1e-8
+ALIGNED_TOLERANCE = 1e-8
 # Maximum prior standard deviation of a weight, in standard deviations of the outputs. It bounds the
 # weights of kernels that are nearly zero at all samples of the expert.
-LARGEST_WEIGHT = 10.0
-ROUNDS = 100  # maximum number of rounds; each takes greedy steps and re-estimates the noise
+MAX_WEIGHT_SIGMA = 10.0
+MAX_ROUNDS = 100  # maximum number of rounds; each takes greedy steps and re-estimates the noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,7 @@ def maximise_evidence(
     start: SparseRegression | None = None,
     *,
     steps: int = 10,
-    rounds: int = ROUNDS,
+    rounds: int = MAX_ROUNDS,
     tolerance: float = 1e-3,
 ) -> SparseRegression:
     """Maximise the evidence, starting from an earlier result or from no functions.
@@ -219,8 +219,8 @@ class _GreedyState:
         self.Q = whitened - half @ whitened[self.active]
         total = float(np.trace(np.linalg.solve(found.noise, sums.outer)))
         variance = max(total / (self.outputs * sums.total), 1e-300)
-        self.least_precision = 1.0 / (LARGEST_WEIGHT**2 * variance)
-        self.least = INDEPENDENT * np.maximum(np.diagonal(self.gram), 1e-300)
+        self.least_precision = 1.0 / (MAX_WEIGHT_SIGMA**2 * variance)
+        self.least = MIN_UNEXPLAINED_SHARE * np.maximum(np.diagonal(self.gram), 1e-300)
         self.is_active = np.zeros(len(self.gram), dtype=bool)
         self.is_active[self.active] = True
         self._exclude()
@@ -253,7 +253,7 @@ class _GreedyState:
         variances = np.diagonal(self.covariance)
         s[own], q[own] = 1.0 / variances - a, q[own] / (a * variances) ** 2
         worth = q > d * s
-        worth[own] &= s[own] > INDEPENDENT * a
+        worth[own] &= s[own] > MIN_UNEXPLAINED_SHARE * a
         s[own] = np.maximum(s[own], 0.0)
         best = d * s**2 / np.where(worth, q - d * s, 1.0)
         best = np.where(worth, np.maximum(best, self.least_precision), np.inf)
@@ -269,7 +269,7 @@ class _GreedyState:
     def _exclude(self) -> None:
         """Exclude candidates that equal an active function, because they would add nothing."""
         squares = np.diagonal(self.gram)
-        aligned = self.gram[:, self.active] ** 2 >= (1.0 - ALIGNED) * np.outer(
+        aligned = self.gram[:, self.active] ** 2 >= (1.0 - ALIGNED_TOLERANCE) * np.outer(
             squares, squares[self.active]
         )
         self.excluded = aligned.any(1) & ~self.is_active
@@ -291,7 +291,7 @@ class _GreedyState:
         self.precisions = np.append(self.precisions, precision)
         self.is_active[k] = True
         squares = np.diagonal(self.gram)
-        self.excluded |= self.gram[:, k] ** 2 >= (1.0 - ALIGNED) * squares * squares[k]
+        self.excluded |= self.gram[:, k] ** 2 >= (1.0 - ALIGNED_TOLERANCE) * squares * squares[k]
         self.excluded[k] = False
 
     def _change(self, place: int, precision: float) -> None:

@@ -29,7 +29,7 @@ from hmt_ros.inference.error_model import seconds
 
 # Cost below which a pair is possible from one image to the next, in sizes of the person; this limit
 # doubles within `EXPECTED_TIME`.
-GATE = 0.4
+GATE_COST = 0.4
 # Time for which a person is assumed to keep velocity and, even if less is visible, size, s.
 EXPECTED_TIME = 1.0
 # Time constant of the velocity of a person in the images, s.
@@ -118,7 +118,7 @@ class ImageTrack:
 
     def gate(self, stamp: int) -> float:
         """Cost from which a sighting is another person."""
-        return GATE * (1.0 + min(seconds(stamp - self.stamp) / EXPECTED_TIME, 1.0))
+        return GATE_COST * (1.0 + min(seconds(stamp - self.stamp) / EXPECTED_TIME, 1.0))
 
 
 def assigned(

@@ -2,9 +2,9 @@
 
 The background is either a given image of the empty scene or learned from frames in which the person
 is absent or moves. A model of the table `BACKGROUNDS` does the per-pixel work, on images reduced
-to about `LINES` lines, so that the cost does not depend on the camera. The outline is interpolated
-to subpixels of these images. A background that shows the person is rebuilt from pixels of later
-images that the person does not cover.
+to about `IMAGE_LINES` lines, so that the cost does not depend on the camera. The outline is
+interpolated to subpixels of these images. A background that shows the person is rebuilt from pixels
+of later images that the person does not cover.
 
 `SceneWatch` checks whether the camera has moved since the background was taken:
 
@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from hmt_ros.core import elementary, gradient_lengths
 from hmt_ros.image.pixel_backgrounds import (
-    FOREGROUND,
-    SHADOW,
+    FOREGROUND_LABEL,
+    SHADOW_LABEL,
     Background,
     mixture_background,
     neighbour_background,
@@ -45,17 +45,17 @@ BACKGROUNDS: dict[str, Callable[[float, float], Background]] = {
 }
 
 # Approximate number of lines of reduced images; they are reduced by an integer factor.
-LINES = 240
+IMAGE_LINES = 240
 
 # Tolerance when a pixel is compared with the neighbouring pixels of the background, grey levels,
 # because compression and aliasing move edges.
-BESIDE = 8
+SPATIAL_TOLERANCE = 8
 # Number of images without the person that must agree before a pixel is known again, and tolerance
 # of this agreement, grey levels.
-AGREEING = 10
-AGREEMENT = 20.0
+AGREEING_IMAGES = 10
+AGREEMENT_TOLERANCE = 20.0
 # Margin around a mask for morphological operations on it, px.
-AROUND = 2
+MASK_MARGIN = 2
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ class BackgroundModel:
         Raises:
             ValueError: no background was learned, or the image has another size.
         """
-        return self._larger(self._subtracted(image) == FOREGROUND)
+        return self._larger(self._subtracted(image) == FOREGROUND_LABEL)
 
     def silhouette(self, image: Image, region: Box | None = None) -> Mask:
         """Foreground (H, W) of an image: the largest piece and pieces near it, without shadow.
@@ -218,7 +218,7 @@ class BackgroundModel:
         part, square = raw[inside], np.ones((3, 3), np.uint8)
         masks = np.zeros((2, *raw.shape), np.bool_)
         if part.size:
-            person, unsure = ((part == x).view(np.uint8) for x in (FOREGROUND, SHADOW))
+            person, unsure = ((part == x).view(np.uint8) for x in (FOREGROUND_LABEL, SHADOW_LABEL))
             if self._factor == 1:
                 person = np.asarray(cv2.morphologyEx(person, cv2.MORPH_OPEN, square), np.uint8)
             for mask, pixels in zip(masks, (person, unsure), strict=True):
@@ -228,7 +228,7 @@ class BackgroundModel:
         return Silhouette(found, unsure > found)
 
     def _subtracted(self, image: Image) -> Image:
-        """Label `FOREGROUND`, `SHADOW` or 0 of each pixel (h, w) of the reduced image."""
+        """Label of each pixel (h, w) of the reduced image; see `pixel_backgrounds`."""
         if self.frames == 0:
             raise ValueError('no background has been learned: give an image or some frames first')
         self._check(image)
@@ -240,7 +240,7 @@ class BackgroundModel:
             return self._last[1]
         small = self._smaller(image)
         raw = self._model.labels(small)
-        raw[(raw & self._beside(small)) == FOREGROUND] = 0
+        raw[(raw & self._beside(small)) == FOREGROUND_LABEL] = 0
         if parts is not None:
             raw[self._any_of(parts.unknown)] = 0
         self.changed = cv2.countNonZero(raw) / raw.size
@@ -254,7 +254,7 @@ class BackgroundModel:
             empty = self.empty
             square = np.ones((3, 3), np.uint8)
             darkest, brightest = cv2.erode(empty, square), cv2.dilate(empty, square)
-            margin = np.full_like(empty, BESIDE)
+            margin = np.full_like(empty, SPATIAL_TOLERANCE)
             self._nearby = (
                 np.asarray(cv2.subtract(darkest, margin), dtype=np.uint8),
                 np.asarray(cv2.add(brightest, margin), dtype=np.uint8),
@@ -265,7 +265,7 @@ class BackgroundModel:
     @property
     def _factor(self) -> int:
         """Integer factor by which images are reduced."""
-        return max(round(self._shape[0] / LINES), 1)
+        return max(round(self._shape[0] / IMAGE_LINES), 1)
 
     def _smaller(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Reduces an image (H, W) or (H, W, 3) by averaging blocks of pixels."""
@@ -345,11 +345,11 @@ class _Parts:
         values = image[rows, columns].astype(np.float32)
         mean, agreeing = self._mean[rows, columns], self._agreeing[rows, columns]
         # Pixels that disagree start again, because a person was there before or is there now.
-        agreeing[np.abs(values - mean).max(1, initial=0.0) > AGREEMENT] = 0
+        agreeing[np.abs(values - mean).max(1, initial=0.0) > AGREEMENT_TOLERANCE] = 0
         agreeing += 1
         self._mean[rows, columns] = mean + (values - mean) / agreeing[:, None]
         self._agreeing[rows, columns] = agreeing
-        done = agreeing >= AGREEING
+        done = agreeing >= AGREEING_IMAGES
         self.unknown[rows[done], columns[done]] = False
         self.changed |= bool(done.any())
 
@@ -403,20 +403,20 @@ def _around(pixels: NDArray[np.bool_ | np.uint8], region: Box | None = None) -> 
     if width == 0:
         return slice(0, 0), slice(0, 0)
     return (
-        slice(top + max(y - AROUND, 0), min(top + y + height + AROUND, bottom)),
-        slice(left + max(x - AROUND, 0), min(left + x + width + AROUND, right)),
+        slice(top + max(y - MASK_MARGIN, 0), min(top + y + height + MASK_MARGIN, bottom)),
+        slice(left + max(x - MASK_MARGIN, 0), min(left + x + width + MASK_MARGIN, right)),
     )
 
 
 WIDTH, REACH = 320, 24
 # Maximum gradient length; standard deviation of the Gaussian before the derivative, px.
-STRONGEST, SMOOTHING = 200.0, 1.0
+MAX_GRADIENT, SMOOTHING_SIGMA = 200.0, 1.0
 # Number of images per examined one, and number of successive examined images that must agree.
-EVERY, IN_A_ROW = 10, 2
+EXAMINATION_INTERVAL, CONFIRMING_IMAGES = 10, 2
 # Minimum correlation at the best shift, and its minimum excess over the correlation at shift 0.
-LEAST, MARGIN = 0.3, 0.05
+MIN_CORRELATION, MIN_CORRELATION_GAIN = 0.3, 0.05
 # Correlation at shift 0, as a fraction of its first value, below which the scene has changed.
-LEFT = 0.4
+OTHER_SCENE_FRACTION = 0.4
 
 
 class SceneWatch:
@@ -436,10 +436,10 @@ class SceneWatch:
         self._edges: NDArray[np.float32] | None = None
         self._usual = 0.0
 
-    def look(self, image: Image, background: BackgroundModel) -> None:
+    def update(self, image: Image, background: BackgroundModel) -> None:
         """Compares an image (H, W, 3) with a background, unless this is partly unknown."""
         self._count += 1
-        if self._count % EVERY != 1 or background.unknown is not None:
+        if self._count % EXAMINATION_INTERVAL != 1 or background.unknown is not None:
             return
         if self._seen != (background, background.frames):
             self._seen = background, background.frames
@@ -447,10 +447,10 @@ class SceneWatch:
         assert self._edges is not None
         shift, best, here = _correlation(self._edges, edges_of(image))
         self._usual = self._usual or here
-        elsewhere = best >= LEAST and best - here >= MARGIN
-        another = self._usual >= LEAST and here < LEFT * self._usual
+        elsewhere = best >= MIN_CORRELATION and best - here >= MIN_CORRELATION_GAIN
+        another = self._usual >= MIN_CORRELATION and here < OTHER_SCENE_FRACTION * self._usual
         self._signs = self._signs + 1 if elsewhere or another else 0
-        self.moved = self._signs >= IN_A_ROW
+        self.moved = self._signs >= CONFIRMING_IMAGES
         self.shift = shift * image.shape[1] / WIDTH if elsewhere else np.nan if another else 0.0
 
 
@@ -458,10 +458,10 @@ def edges_of(image: Image) -> NDArray[np.float32]:
     """Gradient magnitudes (h, w) of an image (H, W, 3) that is reduced to `WIDTH`."""
     height = max(round(image.shape[0] * WIDTH / image.shape[1]), 2 * REACH + 8)
     small = cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA)
-    small = cv2.GaussianBlur(small, (0, 0), SMOOTHING)
+    small = cv2.GaussianBlur(small, (0, 0), SMOOTHING_SIGMA)
     slopes = cv2.Sobel(small, cv2.CV_16S, 1, 0), cv2.Sobel(small, cv2.CV_16S, 0, 1)
     result = np.empty(small.shape[:2], np.float32)
-    gradient_lengths(*slopes, STRONGEST, result)
+    gradient_lengths(*slopes, MAX_GRADIENT, result)
     return result
 
 

@@ -4,9 +4,10 @@ A given background is the empty scene. A background that is learned from images 
 stood still in them. Silhouettes then lack this person, and contain a ghost in the person's place.
 Both look like correct silhouettes, so the fault is found by other cues:
 
-    still     log odds -= dt / STILL          people move; a scene in which nothing does is empty
-    moved     log odds = 0, learned again     a piece as large as a part of a person has changed
-    outline   log odds -= a(dt) N (u - m)     u: share of the outline of a silhouette at which the
+    still     log odds -= dt / STILL_TIME          people move; a scene in which nothing does is
+    empty moved     log odds = 0, learned again     a piece as large as a part of a person has
+    changed outline   log odds -= a(dt) N (u - m)     u: share of the outline of a silhouette at
+    which the
                                               image has the stronger edges, not the background
 
 The log odds are for a person in the learned scene. A person in front of a scene covers its edges; a
@@ -33,18 +34,18 @@ UNSEEN = (
 )
 # Time constant of a person who keeps still, and of a still person whom a detector misses, s;
 # maximum change of the log odds in one image, nats.
-STILL, UNDETECTED, MOST = 0.4, 0.1, 3.5
+STILL_TIME, UNDETECTED_TIME, MAX_NATS = 0.4, 0.1, 3.5
 # Log odds of a person in the scene, nats: maximum for silhouettes to be used; minimum due to
 # stillness alone, because a person may sleep; value below which silhouettes are no longer judged.
-KNOWN, STILLEST, SURE = -3.5, -5.0, -14.0
+USABLE_LOG_ODDS, MIN_STILL_LOG_ODDS, SURE_LOG_ODDS = -3.5, -5.0, -14.0
 # Blur of compared images, px; time constant of their mean, s; minimum change of a pixel that is not
 # noise, grey levels; minimum size of a changed piece that is part of a person, as a fraction of the
 # image (measured: up to 6e-5 in empty scenes, 2e-4 to 3e-3 within 0.5 s for people who stand).
-BLUR, MEMORY, CHANGED, PIECE = 1.5, 1.0, 10.0, 2e-4
+BLUR_SIGMA, MEMORY_TIME, MIN_LEVEL_CHANGE, MIN_PIECE_FRACTION = 1.5, 1.0, 10.0, 2e-4
 # N, m, time constant of errors of the outline, s, and minimum length of the outline, px. On nine
 # rendered clips u is 0.85 to 1 if the background is the empty scene, and 0.25 to 0.66 if it is the
 # first image, until the person has left the place of the ghost.
-NATS, UNDECIDED, TAU, OUTLINE = 16.0, 0.75, 0.2, 40
+OUTLINE_NATS, UNDECIDED_MISFIT, OUTLINE_TIME, MIN_OUTLINE_LENGTH = 16.0, 0.75, 0.2, 40
 
 
 class EmptyScene:
@@ -72,7 +73,7 @@ class EmptyScene:
     @property
     def known(self) -> bool:
         """Whether the scene was seen for long enough and contains nobody."""
-        return self.background.frames > 0 and self.seen and self.log_odds < KNOWN
+        return self.background.frames > 0 and self.seen and self.log_odds < USABLE_LOG_ODDS
 
     @property
     def wants(self) -> str:
@@ -99,16 +100,16 @@ class EmptyScene:
             if self.seen:
                 return
             self.background, self.log_odds = BackgroundModel(self.background.settings), 0.0
-        elif self.log_odds > STILLEST:
-            still = min(dt / (STILL if detected is None else UNDETECTED), MOST)
-            self.log_odds = max(self.log_odds - still, STILLEST)
-            self.seen |= self.log_odds < KNOWN
+        elif self.log_odds > MIN_STILL_LOG_ODDS:
+            still = min(dt / (STILL_TIME if detected is None else UNDETECTED_TIME), MAX_NATS)
+            self.log_odds = max(self.log_odds - still, MIN_STILL_LOG_ODDS)
+            self.seen |= self.log_odds < USABLE_LOG_ODDS
         self._learned, self._edges = stamp, None
         self.background.learn(image)
 
-    def judge(self, image: Image, stamp: int) -> None:
+    def update(self, image: Image, stamp: int) -> None:
         """Updates the log odds from the outline of the silhouette in an image (H, W, 3)."""
-        if not self.seen or self.log_odds <= SURE:
+        if not self.seen or self.log_odds <= SURE_LOG_ODDS:
             return
         now, size = edges_of(image), image.shape[1::-1]
         if self._edges is None:
@@ -118,12 +119,16 @@ class EmptyScene:
         pixels = cv2.resize(silhouette.view(np.uint8), now.shape[::-1])
         square = np.ones((3, 3), np.uint8)
         outline = cv2.morphologyEx(pixels, cv2.MORPH_GRADIENT, square) > 0
-        if np.count_nonzero(outline) < OUTLINE * now.shape[1] / WIDTH:
+        if np.count_nonzero(outline) < MIN_OUTLINE_LENGTH * now.shape[1] / WIDTH:
             return
         stronger = cv2.dilate(now, square) > cv2.dilate(self._edges, square)
         since = math.inf if self._judged is None else seconds(stamp - self._judged)
-        evidence = share_of_time(since, TAU) * NATS * (float(stronger[outline].mean()) - UNDECIDED)
-        self.log_odds -= float(np.clip(evidence, -MOST, MOST))
+        evidence = (
+            share_of_time(since, OUTLINE_TIME)
+            * OUTLINE_NATS
+            * (float(stronger[outline].mean()) - UNDECIDED_MISFIT)
+        )
+        self.log_odds -= float(np.clip(evidence, -MAX_NATS, MAX_NATS))
         self._judged = stamp
 
     def _has_moved(self, image: Image, dt: float) -> bool:
@@ -131,14 +136,14 @@ class EmptyScene:
         width = min(WIDTH, image.shape[1])
         height = max(round(image.shape[0] * width / image.shape[1]), 1)
         resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        small = np.asarray(cv2.GaussianBlur(resized, (0, 0), BLUR), dtype=np.float64)
+        small = np.asarray(cv2.GaussianBlur(resized, (0, 0), BLUR_SIGMA), dtype=np.float64)
         before = self._recent
         if before is None or before.shape != small.shape:
             self._recent = small
             return False
-        changed = (np.abs(small - before).max(axis=2) > CHANGED).view(np.uint8)
+        changed = (np.abs(small - before).max(axis=2) > MIN_LEVEL_CHANGE).view(np.uint8)
         _, _, pieces, _ = cv2.connectedComponentsWithStats(changed, connectivity=8)
-        moved = pieces[1:, cv2.CC_STAT_AREA].max(initial=0) > PIECE * changed.size
-        gain = 1.0 if moved else -float(elementary.expm1(-dt / MEMORY))
+        moved = pieces[1:, cv2.CC_STAT_AREA].max(initial=0) > MIN_PIECE_FRACTION * changed.size
+        gain = 1.0 if moved else -float(elementary.expm1(-dt / MEMORY_TIME))
         self._recent = before + gain * (small - before)
         return bool(moved)

@@ -6,8 +6,8 @@ Errors of images persist, so the energy of a cue g is multiplied by a share a_g,
 the time since the previous image (`inference.error_model`), as in the filter; the prior of an
 exchange of sides is not scaled. A persistent error does not change the shape of a motion. If
 `of_changes` is set, the terms of the image are therefore scaled by `CueErrors.of_changes` instead,
-and covariances are enlarged by `CueErrors.lasting` afterwards. The share of keypoints stays the
-same, because their errors drift, and a motion would follow the drift.
+and covariances are enlarged by `CueErrors.persistence_ratio` afterwards. The share of keypoints
+stays the same, because their errors drift, and a motion would follow the drift.
 
 Each image keeps the bone lengths and the flesh with which its own poses were estimated. Later
 estimates of these move the root along the line of sight, which would look like motion.

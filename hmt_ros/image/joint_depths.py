@@ -26,7 +26,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Index
 
 # Margin of the window around the pixel of a joint, px, and quantile of the depths in this window.
-MARGIN, DEPTH_QUANTILE = 2, 0.25
+MASK_MARGIN, DEPTH_QUANTILE = 2, 0.25
 # Standard deviation of the depth of a joint, apart from the error of the flesh, m.
 DEPTH_SIGMA = 0.03
 # Width of the Geman-McClure kernel, in standard deviations.
@@ -107,7 +107,7 @@ def _depths_at(depths: ImageMap, pixels: Array) -> Array:
     """Depths (P,) of the front surface around pixels (P, 2), m; 0 where nothing was measured."""
     values = depths.values[0]
     height, width = values.shape
-    steps = np.arange(-MARGIN, MARGIN + 1)
+    steps = np.arange(-MASK_MARGIN, MASK_MARGIN + 1)
     # Clip pixels of points far outside or behind the camera; they stay outside the image.
     centres = np.clip(np.nan_to_num(pixels, nan=-1e6), -1e6, 1e6)
     columns, rows = (np.rint(centres) - [depths.left, depths.top]).astype(np.intp).T

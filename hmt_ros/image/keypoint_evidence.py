@@ -12,7 +12,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
 
 # Minimum number of keypoints of a person.
-FEWEST_KEYPOINTS = 6
+MIN_KEYPOINTS = 6
 # Minimum confidence for the position of a keypoint to be trusted.
 MIN_CONFIDENCE = 0.5
 # Magnification, px/m, at which keypoints are no evidence of a person; at twice this value they are
@@ -29,9 +29,9 @@ def keypoint_evidence(keypoints: Keypoints, body: Body) -> float:
     """
     seen = keypoints.confidences[keypoints.seen]
     most = 0.0
-    if len(seen) >= FEWEST_KEYPOINTS:
+    if len(seen) >= MIN_KEYPOINTS:
         most = min(max(_magnification(keypoints, body) / MIN_MAGNIFICATION - 1.0, 0.0), 1.0)
-    whole = float(seen.sum()) / (FEWEST_KEYPOINTS * MIN_CONFIDENCE)
+    whole = float(seen.sum()) / (MIN_KEYPOINTS * MIN_CONFIDENCE)
     return float(np.clip(3.0 * whole - 2.0, -1.0, most))
 
 
@@ -45,7 +45,7 @@ def suffices(keypoints: Keypoints | None, body: Body) -> bool:
     names = _confident(keypoints)
     trunk = [name for pair in body.trunk_pairs for name in pair]
     of_trunk = sum(name in names for name in trunk)
-    return len(names) >= FEWEST_KEYPOINTS and of_trunk >= len(trunk) - 1
+    return len(names) >= MIN_KEYPOINTS and of_trunk >= len(trunk) - 1
 
 
 def shows_a_part(keypoints: Keypoints | None, body: Body) -> bool:

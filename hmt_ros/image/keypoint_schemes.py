@@ -21,7 +21,7 @@ from msg_tools.files.plain_yaml import read_plain_yaml
 SIDES = ('right', 'left')
 MIRROR = np.array([-1.0, 1.0, 1.0])
 AUTO, JOINTS = 'auto', 'joints'
-LARGEST_FILE = 1_000_000  # bytes
+MAX_FILE_BYTES = 1_000_000  # bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Scheme:
 def _table() -> Any:
     file = resources.files('hmt_ros.image') / 'keypoint_schemes.yaml'
     with resources.as_file(file) as path:
-        return read_plain_yaml(path, LARGEST_FILE)
+        return read_plain_yaml(path, MAX_FILE_BYTES)
 
 
 @cache

@@ -24,7 +24,7 @@ from hmt_ros.core import elementary, resize_bones
 from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.linear_algebra import product
 
-WHOLE = {
+WHOLE_BODY_CARRIERS = {
     'pelvis',
     'neck',
     'head',
@@ -35,7 +35,7 @@ WHOLE = {
     ),
 }
 # Standard deviation of a joint without an estimate, m.
-UNKNOWN = 0.5
+UNKNOWN_SIGMA = 0.5
 HIPS = ('left_hip', 'right_hip')
 # Parent of each kind of joint; joints of other kinds have the middle of the hips as parent.
 CARRIERS = {
@@ -79,7 +79,7 @@ class LiftedPoses:
     @property
     def are_whole(self) -> bool:
         """Whether the joints determine a whole pose; only toes and hands can be missing."""
-        return {*self.joints} >= WHOLE
+        return {*self.joints} >= WHOLE_BODY_CARRIERS
 
     def of_joints(self, names: Sequence[str]) -> LiftedPoses:
         """The mixture restricted to the named joints."""
@@ -128,14 +128,14 @@ def pooled(opinions: Sequence[LiftedPoses]) -> LiftedPoses:
     """One mixture from several estimates of one pose, with equal weights.
 
     The estimates use the same image, so they are not independent, and their densities are averaged.
-    A joint that an estimate lacks has the standard deviation `UNKNOWN` in its components.
+    A joint that an estimate lacks has the standard deviation `UNKNOWN_SIGMA` in its components.
     """
     first = opinions[0]
     if len(opinions) == 1:
         return first
     c = sum(len(one.log_weights) for one in opinions)
     means = np.zeros((c, len(first.joints), 3))
-    deviations = np.full(means.shape, UNKNOWN)
+    deviations = np.full(means.shape, UNKNOWN_SIGMA)
     row = 0
     for one in opinions:
         rows = slice(row, row + len(one.log_weights))
@@ -163,7 +163,7 @@ def from_positions(
         axes: (3, 3) as in `LiftedPoses`.
         deviations: standard deviations of joints by their kind, m.
         seen: (n,) whether the network has seen a joint; other joints have the standard deviation
-            `UNKNOWN`. None: all were seen.
+            `UNKNOWN_SIGMA`. None: all were seen.
     """
     known: dict[str, int] = {}
     for i in np.flatnonzero(np.isfinite(positions).all(1)).tolist():
@@ -177,7 +177,7 @@ def from_positions(
     lengths = np.linalg.norm(bones(names, places, np.zeros(3)), axis=1)
     spread = np.array([deviations[name.rpartition('_')[2]] for name in names])
     if seen is not None:
-        spread[~seen[[known[name] for name in names]]] = UNKNOWN
+        spread[~seen[[known[name] for name in names]]] = UNKNOWN_SIGMA
     return LiftedPoses(
         names,
         np.zeros(1),

@@ -22,7 +22,7 @@ from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.image_term import ImageWindow
 
 # Minimum side of an image for its flow to be computed, px; smaller images have flow 0.
-SMALLEST = 32
+MIN_IMAGE_SIDE = 32
 
 
 def optical_flow(window: ImageWindow) -> ImageMap | None:
@@ -33,7 +33,7 @@ def optical_flow(window: ImageWindow) -> ImageMap | None:
     if window.last_image is None:
         return None
     grey = [cv2.cvtColor(x, cv2.COLOR_BGR2GRAY) for x in (window.last_image, window.image)]
-    if min(grey[0].shape) < SMALLEST:
+    if min(grey[0].shape) < MIN_IMAGE_SIDE:
         return window.as_map(np.zeros((2, *grey[0].shape), np.float32))
     # The type stubs do not allow None as initial flow.
     method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)

@@ -38,7 +38,7 @@ MEMORY_TIME = 2.0
 LEARNING_INTERVAL = 0.1
 # Changed pixels beyond the model that mean another scene, as a fraction of the pixels not beyond it
 # or, if fewer, of all pixels beyond it. It allows for the person's shadow.
-LARGEST_CHANGE = 0.25
+MAX_CHANGE = 0.25
 # Minimum difference between the probabilities `here` and `elsewhere` for colours to be evidence.
 MIN_CONTRAST = 0.15
 # Number of bins of a colour channel with values from 0 to 255.
@@ -107,7 +107,7 @@ class Colours:
         changed, outside = self._changed(image), counted(self._beyond)
         least = min(self._beyond.size - outside, outside)
         share = counted(changed & self._beyond) / max(least, 1)
-        return max(1.0 - share / LARGEST_CHANGE, 0.0)
+        return max(1.0 - share / MAX_CHANGE, 0.0)
 
     def motion(self, image: Image) -> Motion:
         """Changes from the last learned image to an image (h, w, 3)."""

@@ -16,11 +16,11 @@ from hmt_ros.image.surface_points import coarse_mesh
 from hmt_ros.inference.arrays import Array, Mask
 
 # Approximate height of the coarse raster for areas and colours, px.
-RASTER = 240
+RASTER_HEIGHT = 240
 # Minimum length of a person's silhouette, px; minimum area as a fraction of the squared length, to
 # exclude lines; maximum area as a fraction of the bounding box, to exclude rectangles.
-LEAST_LENGTH = 40
-LEAST_FILLED, MOST_FILLED = 0.04, 0.9
+MIN_LENGTH = 40
+MIN_FILLED, MAX_FILLED = 0.04, 0.9
 
 
 class Piece(NamedTuple):
@@ -37,7 +37,7 @@ class Piece(NamedTuple):
 
 def raster_step(height: int) -> int:
     """Step of the raster in pixels of an image of this height."""
-    return max(round(height / RASTER), 1)
+    return max(round(height / RASTER_HEIGHT), 1)
 
 
 def on_raster(image: NDArray[Any], raster: Mask) -> NDArray[Any]:
@@ -77,9 +77,9 @@ def largest_person(foreground: Mask, step: int = 1) -> Piece | None:
 def _is_person(width: int, height: int, area: int, step: int) -> bool:
     length = max(width, height)
     return (
-        step * length >= LEAST_LENGTH
-        and area >= LEAST_FILLED * length**2
-        and area <= MOST_FILLED * width * height
+        step * length >= MIN_LENGTH
+        and area >= MIN_FILLED * length**2
+        and area <= MAX_FILLED * width * height
     )
 
 

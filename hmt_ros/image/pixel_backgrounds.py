@@ -15,7 +15,7 @@ from hmt_ros.inference.arrays import Image
 
 # Label of a pixel that differs from the background, and of a darker pixel of the same colour. All
 # other pixels have the label 0.
-FOREGROUND, SHADOW = 255, 127
+FOREGROUND_LABEL, SHADOW_LABEL = 255, 127
 
 
 class Background(Protocol):
@@ -45,7 +45,7 @@ class Background(Protocol):
         ...
 
     def labels(self, image: Image) -> Image:
-        """Labels (h, w), `FOREGROUND`, `SHADOW` or 0, of an image; the model does not change."""
+        """Labels (h, w) of an image: `FOREGROUND_LABEL`, `SHADOW_LABEL` or 0."""
         ...
 
 

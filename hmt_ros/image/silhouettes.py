@@ -84,7 +84,7 @@ class Silhouettes:
         self.doubted, self._learning = False, not self._shared
         self.watch = SceneWatch()
 
-    def see_from(self, pose: CameraPose, camera: Camera) -> None:
+    def set_camera_pose(self, pose: CameraPose, camera: Camera) -> None:
         """Sets the pose of the camera; if the view has changed, the background is forgotten."""
         if self._seen_from is None:
             self._seen_from = pose
@@ -123,10 +123,10 @@ class Silhouettes:
         if self.doubted or not (scene.seen and scene.background.frames):
             return None
         if not self._shared:
-            self.watch.look(image, self.background)
-        scene.judge(image, stamp)
+            self.watch.update(image, self.background)
+        scene.update(image, stamp)
         if scene.is_of_somebody:
-            self._doubt()
+            self._forget_background()
         return self.background.split(image, region, others) if scene.known else None
 
     def anywhere(self, image: Image, mask: Mask | None, others: Mask | None, step: int) -> Mask:
@@ -155,9 +155,9 @@ class Silhouettes:
         if not inside.any():
             return
         if self.background.foreground(image)[inside].mean() < MIN_FOREGROUND_FRACTION:
-            self._doubt()
+            self._forget_background()
 
-    def _doubt(self) -> None:
+    def _forget_background(self) -> None:
         """Forgets a background that shows the person."""
         self.doubted = True
         self.background.forget()

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.model_file import LARGEST_FILE
+from hmt_ros.body.model_file import MAX_FILE_BYTES
 from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools.files.plain_yaml import read_plain_yaml
 
-LARGEST_PIXEL = 1e5
-LONGEST = 3.0  # m
+MAX_PIXEL = 1e5
+MAX_LENGTH = 3.0  # m
 KEYS = ('stamp_ns', 'sigma_px', 'keypoints', 'segment_lengths_m', 'stature_m')
 
 
@@ -50,7 +50,7 @@ def read_subject(path: str | Path, body: Body) -> Subject:
             that the body does not have.
     """
     try:
-        return parse_subject(read_plain_yaml(path, LARGEST_FILE), body)
+        return parse_subject(read_plain_yaml(path, MAX_FILE_BYTES), body)
     except ValueError as fault:
         raise SubjectError(f'{path}: {fault}') from fault
 
@@ -91,7 +91,7 @@ def parse_subject(content: Any, body: Body) -> Subject:
     checked = {name: _length(value, name, signed[name]) for name, value in lengths.items()}
     stature = content.get('stature_m')
     if stature is not None:
-        stature = _positive(stature, 'stature_m', LONGEST)
+        stature = _positive(stature, 'stature_m', MAX_LENGTH)
     return Subject(stamp, keypoints, checked, stature)
 
 
@@ -101,7 +101,7 @@ def _check_names(given: dict[Any, Any], known: tuple[str, ...], kind: str, body:
         raise SubjectError(f'{body} has no {kind} {wrong}; it has {sorted(known)}')
 
 
-def _positive(value: Any, name: str, largest: float = LARGEST_PIXEL) -> float:
+def _positive(value: Any, name: str, largest: float = MAX_PIXEL) -> float:
     if isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value <= largest:
         return float(value)
     raise SubjectError(f'{name} must be a number above 0 and at most {largest:g}, saw {value!r}')
@@ -110,11 +110,11 @@ def _positive(value: Any, name: str, largest: float = LARGEST_PIXEL) -> float:
 def _length(value: Any, name: str, signed: bool) -> float:
     """Checks a length, m; a signed length, such as an offset, can be negative."""
     if not signed:
-        return _positive(value, f'length {name}', LONGEST)
-    if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LONGEST:
+        return _positive(value, f'length {name}', MAX_LENGTH)
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= MAX_LENGTH:
         return float(value)
     raise SubjectError(
-        f'length {name} must be a number from {-LONGEST:g} to {LONGEST:g}, saw {value!r}'
+        f'length {name} must be a number from {-MAX_LENGTH:g} to {MAX_LENGTH:g}, saw {value!r}'
     )
 
 
@@ -123,7 +123,7 @@ def _pixel(name: str, value: Any) -> tuple[float, float]:
         isinstance(value, (list, tuple))
         and len(value) == 2
         and all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in value)
-        and all(abs(x) < LARGEST_PIXEL for x in value)
+        and all(abs(x) < MAX_PIXEL for x in value)
     ):
         return float(value[0]), float(value[1])
     raise SubjectError(f'keypoint {name} must be [u, v] in pixels, saw {value!r}')

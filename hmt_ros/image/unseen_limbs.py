@@ -27,14 +27,14 @@ from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.inference.error_model import seconds
 
 # Confidence below which a keypoint is a guess.
-GUESSED = 0.02
+MAX_GUESS_CONFIDENCE = 0.02
 # Confidence above which a keypoint is more likely seen than guessed.
-SEEN = 0.5
+MIN_SEEN_CONFIDENCE = 0.5
 # Time after the last evidence for which a limb still counts as visible, or as hidden, s.
-SHORT = 1.0
+MEMORY_TIME = 1.0
 # Error of an unseen joint per bone of its limb, as a fraction of the bone's length, because lengths
 # of people vary and a linear map is inexact within a posture.
-ALONG_LIMB = 0.08
+ERROR_PER_BONE = 0.08
 
 
 class UnseenLimbs:
@@ -59,11 +59,11 @@ class UnseenLimbs:
         Args:
             body: body of the person.
             keypoints: keypoints of an image; None if the detector gave no result. Then hidden
-                segments stay hidden for up to `SHORT` after its last result.
+                segments stay hidden for up to `MEMORY_TIME` after its last result.
             stamp: stamp of the image, ns.
         """
         if keypoints is None:
-            if seconds(stamp - self._answered) > SHORT:
+            if seconds(stamp - self._answered) > MEMORY_TIME:
                 self.hidden = None
             return None
         self._answered, hidden = stamp, hidden_segments(body.skeleton, keypoints)
@@ -75,7 +75,7 @@ class UnseenLimbs:
             keypoints, confidences=np.where(hidden[segments], 0.0, keypoints.confidences)
         )
 
-    def look(
+    def update(
         self, body: Body, camera: Camera, observation: Observation, pose: Array, dt: float
     ) -> None:
         """Updates the times with an image and its likeliest pose (d,).
@@ -96,22 +96,22 @@ class UnseenLimbs:
         return times[body.skeleton.dof_segments]
 
     def shown_joints(self, body: Body) -> Mask:
-        """Joints (J,) that were visible within the time `SHORT`."""
-        return np.asarray(self.times[body.skeleton.joint_segments] < SHORT)
+        """Joints (J,) that were visible within the time `MEMORY_TIME`."""
+        return np.asarray(self.times[body.skeleton.joint_segments] < MEMORY_TIME)
 
-    def told(self, body: Body) -> Body:
+    def with_larger_errors(self, body: Body) -> Body:
         """The body with larger errors of unseen joints, for unknown lengths and motion on arcs."""
         hidden = self.times > 0.0
-        return _told(body, tuple(hidden.tolist())) if hidden.any() else body
+        return _with_larger_errors(body, tuple(hidden.tolist())) if hidden.any() else body
 
 
 @lru_cache(maxsize=8)
-def _told(body: Body, hidden: tuple[bool, ...]) -> Body:
+def _with_larger_errors(body: Body, hidden: tuple[bool, ...]) -> Body:
     skeleton, away = body.skeleton, np.zeros(len(hidden))
     for chain in body.chains.values():
         own = list(chain[1:])
         away[own] = np.cumsum((skeleton.offsets[own] ** 2).sum(1))
-    more = ALONG_LIMB**2 * (away * hidden)[skeleton.joint_segments]
+    more = ERROR_PER_BONE**2 * (away * hidden)[skeleton.joint_segments]
     return body.with_beliefs(joint_errors=np.sqrt(body.joint_errors**2 + more))
 
 
@@ -119,7 +119,7 @@ def hidden_segments(skeleton: Skeleton, keypoints: Keypoints) -> Mask:
     """Segments (S,) of legs beyond the thigh that something hides from a detector."""
     hidden = np.zeros(len(skeleton.parents), dtype=np.bool_)
     segments = skeleton.joint_segments[skeleton.joint_index(keypoints.names)]
-    sure = keypoints.seen & (keypoints.confidences >= SEEN)
+    sure = keypoints.seen & (keypoints.confidences >= MIN_SEEN_CONFIDENCE)
     for own in skeleton.chains.values():
         beyond = np.isin(segments, own[1:])
         if skeleton.parents[own[0]] == 0 and beyond.any() and not sure[beyond].any():
@@ -134,7 +134,7 @@ def shown_segments(body: Body, camera: Camera, observation: Observation, pose: A
         origins = forward(skeleton, pose[None]).segments[1][0]
         shown = _inside(camera, camera.project(origins))
     else:
-        found = _inside(camera, keypoints.pixels) & (keypoints.confidences >= GUESSED)
+        found = _inside(camera, keypoints.pixels) & (keypoints.confidences >= MAX_GUESS_CONFIDENCE)
         joints = skeleton.joint_index(tuple(keypoints.names[i] for i in np.flatnonzero(found)))
         shown = np.zeros(len(skeleton.parents), dtype=np.bool_)
         shown[skeleton.joint_segments[joints]] = True

@@ -28,30 +28,30 @@ from hmt_ros.inference.linear_algebra import inverse, length, log_sum_exp, produ
 from hmt_ros.inference.logistic import probability_of
 
 # Rotation `level` of an upright camera.
-UPRIGHT = np.eye(3)
+UPRIGHT_FRAME = np.eye(3)
 # Maximum side of an image, px (larger ones are reduced), and minimum length of a line, rad.
-LARGEST, SHORTEST = 800, 0.03
+MAX_IMAGE_SIDE, MIN_LINE_LENGTH = 800, 0.03
 # Angle below which two lines are one line, between their planes through the camera, rad.
-SAME_LINE = np.radians(0.7)
+SAME_LINE_ANGLE = np.radians(0.7)
 # Share of lines that follow the frame; standard deviation of an end of a line, px.
-SHARE, END_SIGMA = 0.5, 0.5
+FRAME_SHARE, END_SIGMA = 0.5, 0.5
 # Prior over orientations of cameras, rad: mean pitch (positive downwards), its standard deviations
 # upwards and downwards, and its limits; standard deviation of roll, and its limit.
 PITCH, PITCH_SIGMA = np.radians(5.0), (np.radians(12.0), np.radians(20.0))
-PITCHES = np.radians(-40.0), np.radians(72.0)
-ROLL, MOST_ROLL = np.radians(6.0), np.radians(32.0)
+PITCH_LIMITS = np.radians(-40.0), np.radians(72.0)
+ROLL_SIGMA, MAX_ROLL = np.radians(6.0), np.radians(32.0)
 # Step of the raster of frames, and standard deviations of the angle of a line on the raster and in
 # each round of the refinement, rad.
-STEP, COARSE = np.radians(4.0), np.radians(2.5)
-FINER = tuple(np.radians([4.0, 3.0, 2.0, 1.0, 0.5, 0.5, 0.5]))
+RASTER_STEP, COARSE_SIGMA = np.radians(4.0), np.radians(2.5)
+REFINED_SIGMAS = tuple(np.radians([4.0, 3.0, 2.0, 1.0, 0.5, 0.5, 0.5]))
 # Standard deviation of the vertical of the best frame on the raster, and minimum standard deviation
 # after the refinement, because walls lean and lenses bend lines, rad.
-RASTER_SIGMA, LEAST_SIGMA = np.radians(4.0), np.radians(1.0)
+RASTER_SIGMA, MIN_SIGMA = np.radians(4.0), np.radians(1.0)
 # Probability that a detected vertical is right, and density of a wrong vertical, 1/sr.
-RIGHT, ANYWHERE = 0.9, 1.0 / (2.0 * np.pi)
+CORRECT_PROBABILITY, UNIFORM_DENSITY = 0.9, 1.0 / (2.0 * np.pi)
 # Minimum probability that a frame exists with its vertical near the best one, and radius of this
 # neighbourhood, rad.
-BELIEVED, SURROUNDINGS = 0.95, np.radians(10.0)
+MIN_FRAME_PROBABILITY, NEIGHBOURHOOD_RADIUS = 0.95, np.radians(10.0)
 
 
 class Lines(NamedTuple):
@@ -85,21 +85,21 @@ class Vertical:
         variance = sigma**2 + self.sigma**2
         square = 2.0 - 2.0 * float(product(up, self.up))
         near = elementary.exp(-0.5 * square / variance) / (2.0 * np.pi * variance)
-        return float(RIGHT * near / ANYWHERE + 1.0 - RIGHT)
+        return float(CORRECT_PROBABILITY * near / UNIFORM_DENSITY + 1.0 - CORRECT_PROBABILITY)
 
     def refined(self, up: Array, sigma: float) -> Vertical:
         """Another vertical `up` (3,), refined by this one as far as both agree.
 
         The other vertical moves by at most its standard deviation `sigma`.
         """
-        right = 1.0 - (1.0 - RIGHT) / self.agreement(up, sigma)
+        right = 1.0 - (1.0 - CORRECT_PROBABILITY) / self.agreement(up, sigma)
         share = max(right, 0.0) * sigma**2 / (sigma**2 + self.sigma**2)
         share = min(share, sigma / max(length(self.up - up), 1e-9))
         mean = (1.0 - share) * up + share * self.up
         return Vertical(mean / length(mean), sigma * float(np.sqrt(1.0 - share)))
 
 
-def seen_vertical(image: Image, camera: Camera, level: Array = UPRIGHT) -> Vertical | None:
+def seen_vertical(image: Image, camera: Camera, level: Array = UPRIGHT_FRAME) -> Vertical | None:
     """The vertical from the lines of an image (H, W) or (H, W, 3); None if they show no vertical.
 
     Args:
@@ -118,7 +118,7 @@ def seen_vertical(image: Image, camera: Camera, level: Array = UPRIGHT) -> Verti
 def straight_lines(image: Image, camera: Camera) -> Lines:
     """The straight lines of an image (H, W) or (H, W, 3), longest first, without duplicates."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    scale = min(LARGEST / max(grey.shape), 1.0)
+    scale = min(MAX_IMAGE_SIDE / max(grey.shape), 1.0)
     if scale < 1.0:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     found: Any = cv2.createLineSegmentDetector().detect(np.ascontiguousarray(grey))[0]
@@ -131,7 +131,7 @@ def straight_lines(image: Image, camera: Camera) -> Lines:
     normals = np.cross(rays[:, 0], rays[:, 1])
     angle = np.linalg.norm(normals, axis=1)
     order = np.argsort(-angle, kind='stable')
-    order = order[angle[order] > SHORTEST]
+    order = order[angle[order] > MIN_LINE_LENGTH]
     normals = normals[order] / angle[order, None]
     kept = _distinct(normals)
     middles = rays[order].sum(1)[kept]
@@ -146,25 +146,25 @@ def straight_lines(image: Image, camera: Camera) -> Lines:
 def vertical_of(lines: Lines) -> Vertical | None:
     """The vertical from lines; None if they are clutter or fit several verticals."""
     raster = _raster()
-    ratios = _ratios(raster.directions, lines, COARSE)
+    ratios = _ratios(raster.directions, lines, COARSE_SIGMA)
     value = np.empty(raster.first.shape)
-    rate_frames(ratios, raster.vertical, raster.first, raster.second, SHARE, value)
+    rate_frames(ratios, raster.vertical, raster.first, raster.second, FRAME_SHARE, value)
     posterior = log_sum_exp(value) - elementary.log(len(raster.first[0])) + raster.log_prior
     evidence = float(log_sum_exp(posterior))
     found = _refined(raster.ups[posterior.argmax()], lines)
-    near = product(raster.ups, found.up) > elementary.cos(SURROUNDINGS)
+    near = product(raster.ups, found.up) > elementary.cos(NEIGHBOURHOOD_RADIUS)
     believed = probability_of(evidence) * elementary.exp(posterior[near] - evidence).sum()
-    return found if believed > BELIEVED else None
+    return found if believed > MIN_FRAME_PROBABILITY else None
 
 
 def _refined(start: Array, lines: Lines) -> Vertical:
     """The vertical from the lines that agree with it; `start` (3,) is from the raster."""
     up = start
     information = np.eye(3)
-    for sigma in FINER:
+    for sigma in REFINED_SIGMAS:
         ratios = _ratios(up[None], lines, sigma)[0]
-        agree = SHARE / 3.0 * ratios
-        weight = agree / (agree + 1.0 - SHARE / 3.0) / (sigma**2 + lines.errors**2)
+        agree = FRAME_SHARE / 3.0 * ratios
+        weight = agree / (agree + 1.0 - FRAME_SHARE / 3.0) / (sigma**2 + lines.errors**2)
         foreshortening = 1.0 / np.sqrt(np.maximum(1.0 - product(lines.middles, up) ** 2, 1e-4))
         slopes = foreshortening[:, None] * np.cross(up, lines.normals)
         information = product((slopes * weight[:, None]).T, slopes) + np.eye(3) / RASTER_SIGMA**2
@@ -175,7 +175,7 @@ def _refined(start: Array, lines: Lines) -> Vertical:
         up = up / length(up)
     across = np.cross(np.eye(3), up)
     covariance = product(product(across, inverse(information)), across.T)
-    return Vertical(up, float(np.sqrt(covariance.trace() / 2.0 + LEAST_SIGMA**2)))
+    return Vertical(up, float(np.sqrt(covariance.trace() / 2.0 + MIN_SIGMA**2)))
 
 
 def _ratios(directions: Array, lines: Lines, sigma: float) -> Array:
@@ -188,7 +188,7 @@ def _ratios(directions: Array, lines: Lines, sigma: float) -> Array:
 
 def _distinct(normals: Array) -> Index:
     """Indices of unit normals (N, 3) that differ from all normals kept before."""
-    same = np.abs(product(normals, normals.T)) > elementary.cos(SAME_LINE)
+    same = np.abs(product(normals, normals.T)) > elementary.cos(SAME_LINE_ANGLE)
     free = np.ones(len(normals), dtype=np.bool_)
     kept = []
     for i in range(len(normals)):
@@ -222,8 +222,8 @@ def _raster() -> _Raster:
     pitch, roll = (
         x.ravel()
         for x in np.meshgrid(
-            np.arange(PITCHES[0], PITCHES[1] + 1e-9, STEP),
-            np.arange(-MOST_ROLL, MOST_ROLL + 1e-9, STEP),
+            np.arange(PITCH_LIMITS[0], PITCH_LIMITS[1] + 1e-9, RASTER_STEP),
+            np.arange(-MAX_ROLL, MAX_ROLL + 1e-9, RASTER_STEP),
             indexing='ij',
         )
     )
@@ -238,10 +238,10 @@ def _raster() -> _Raster:
     deviation = np.where(pitch < PITCH, *PITCH_SIGMA)
     log_prior = (
         -0.5 * ((pitch - PITCH) / deviation) ** 2
-        - 0.5 * (roll / ROLL) ** 2
+        - 0.5 * (roll / ROLL_SIGMA) ** 2
         + elementary.log(elementary.cos(pitch))
     )
-    turns = np.arange(0.0, np.pi / 2.0 - 1e-9, STEP)
+    turns = np.arange(0.0, np.pi / 2.0 - 1e-9, RASTER_STEP)
     across = np.cross(ups, [0.0, 0.0, 1.0])
     across = across / np.linalg.norm(across, axis=1, keepdims=True)
     ahead = np.cross(ups, across)
@@ -251,7 +251,7 @@ def _raster() -> _Raster:
     # Directions are rounded to half a step.
     every = np.concatenate([ups, first.reshape(-1, 3), second.reshape(-1, 3)])
     every = every * np.where(every[:, 2:] < 0.0, -1.0, 1.0)
-    cells = np.round(every / (0.5 * STEP)).astype(np.int64)
+    cells = np.round(every / (0.5 * RASTER_STEP)).astype(np.int64)
     _, places, which = np.unique(cells, axis=0, return_index=True, return_inverse=True)
     which = which.reshape(-1)
     count, pairs = len(ups), first.shape[0] * first.shape[1]

@@ -27,7 +27,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hmt_ros.core import DAMPING_LIMIT, LEAST_FACTOR, LEAST_RATIO, box_steps
+from hmt_ros.core import DAMPING_LIMIT, MIN_FACTOR, MIN_RATIO, box_steps
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import EnergyTerm
 
@@ -100,7 +100,7 @@ def minimise(
     value, gradient, hessian = (
         np.array(part, dtype=np.float64, order='C') for part in (first.value, *first.derivatives())
     )
-    region = TrustRegion(n, damping, limit=DAMPING_LIMIT, least_factor=LEAST_FACTOR)
+    region = TrustRegion(n, damping, limit=DAMPING_LIMIT, least_factor=MIN_FACTOR)
     iterations = np.zeros(n, dtype=np.int32)
     status = np.full(n, Status.ITERATION_LIMIT, dtype=np.int8)
     status[~np.isfinite(value)] = Status.NOT_FINITE
@@ -184,7 +184,7 @@ class TrustRegion:
             predicted: (n,) predicted decrease, positive.
         """
         ratio = np.where(np.isfinite(decrease), decrease, -np.inf) / predicted
-        better: NDArray[np.bool_] = ratio > LEAST_RATIO
+        better: NDArray[np.bool_] = ratio > MIN_RATIO
         taken = rows[better]
         gain = 2.0 * np.minimum(ratio[better], 2.0) - 1.0
         factor = 1.0 - gain * gain * gain

@@ -27,7 +27,7 @@ from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 
 # Nodes and weights of the quadrature, and the bound on G t below which it is exact to rounding.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
-_LONGEST = 4.0
+_MAX_EXPONENT = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class DampedVelocity(LinearGaussianDynamics):
     def _integrals(self, interval: float) -> tuple[Array, Array, Array]:
         """Integrals (d, d) over the interval of a a', a b' and b b'."""
         g = self.damping
-        if g.max() * interval < _LONGEST:
+        if g.max() * interval < _MAX_EXPONENT:
             times = 0.5 * interval * (_NODES + 1.0)
             root = np.sqrt(0.5 * interval * _WEIGHTS)[:, None]
             lost = -elementary.expm1(-times[:, None] * g)

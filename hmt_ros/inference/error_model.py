@@ -81,7 +81,7 @@ class CueErrors:
         new = -float(elementary.expm1(-2.0 * dt / self.time)) if self.time > 0.0 else 1.0
         return self.independent / new
 
-    def lasting(self, dt: float) -> float:
+    def persistence_ratio(self, dt: float) -> float:
         """Ratio 1 / (1 - rho)^2 of `of_changes` to `share`, which scales variances."""
         return self.of_changes(dt) / self.share(dt)
 
@@ -115,26 +115,26 @@ def errors_of_cues(amounts: Mapping[str, float]) -> CueErrors:
 
 # Ratio of the covariance of a pose given all images so far to that given the last image alone, with
 # its share of the evidence; see `benchmarks/joint_errors.py`.
-TOGETHER = 0.29
+JOINT_COVARIANCE_RATIO = 0.29
 
 # Chosen, not learned, at 30 and 3 images per second (docs/tracking.md). The prior of the pose is
 # discounted like a cue, because it evaluates the same pose again in every image. `lifted` are the
 # depths from experts, which also have a weight of their own. `shape` is the evidence from images on
 # lengths and flesh: different poses are independent evidence on these, but not on clothes. Its
 # constant share was chosen among 0.03, 0.12 and 0.3 on clips played back and forth for 45 s.
-_IMAGE, _KEYPOINTS = CueErrors(0.15, 0.019), CueErrors(0.35, 0.053)
+_IMAGE_ERRORS, _KEYPOINT_ERRORS = CueErrors(0.15, 0.019), CueErrors(0.35, 0.053)
 ERRORS: Mapping[str, CueErrors] = MappingProxyType(
     {
-        'image': _IMAGE,
-        'keypoints': _KEYPOINTS,
+        'image': _IMAGE_ERRORS,
+        'keypoints': _KEYPOINT_ERRORS,
         'lifted': CueErrors(1.0, 0.067),
-        'prior': _IMAGE,
-        'shape': replace(_KEYPOINTS, constant=0.12),
+        'prior': _IMAGE_ERRORS,
+        'shape': replace(_KEYPOINT_ERRORS, constant=0.12),
     }
 )
 # Factor on the depths from experts if they are discounted like keypoints: the ratio of the
 # information per second of both at a high rate.
-LIFTED_AS_KEYPOINTS = (
+LIFTED_INFORMATION_RATIO = (
     ERRORS['lifted'].independent
     / ERRORS['lifted'].time
     * ERRORS['keypoints'].time

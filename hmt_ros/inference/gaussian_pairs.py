@@ -15,7 +15,7 @@ from hmt_ros.inference.threads import in_threads
 Index = NDArray[np.int64]
 
 # Minimum number of pairs per thread.
-LEAST_SHARED = 128
+MIN_PAIRS_PER_THREAD = 128
 
 
 def pair_log_densities(
@@ -63,5 +63,5 @@ def _of_pairs(pairs: Index, scales: Array, *sets: Array) -> tuple[Array, Array]:
         at = slice(first, last)
         whiten_pairs(a, big_a, b, big_b, pairs[at], s[at], squares[at], log_determinants[at])
 
-    in_threads(work, len(pairs), LEAST_SHARED)
+    in_threads(work, len(pairs), MIN_PAIRS_PER_THREAD)
     return squares, log_determinants

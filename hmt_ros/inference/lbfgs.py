@@ -17,11 +17,11 @@ import numpy as np
 
 from hmt_ros.inference.arrays import Array
 
-DECREASE, CURVATURE, NARROW = 1e-3, 0.9, 0.1
-LARGEST_STEP = 1e10
-SEARCHES = 20  # maximum number of evaluations in one line search
+DECREASE, CURVATURE, MIN_BRACKET = 1e-3, 0.9, 0.1
+MAX_STEP = 1e10
+MAX_LINE_SEARCH_STEPS = 20  # maximum number of evaluations in one line search
 # Convergence thresholds: relative decrease of the value, maximum absolute gradient component.
-LEAST_FALL, LEAST_GRADIENT = 1e7 * np.finfo(np.float64).eps, 1e-5
+MIN_DECREASE, MIN_GRADIENT = 1e7 * np.finfo(np.float64).eps, 1e-5
 
 Function = Callable[[Array], tuple[float, Array]]
 
@@ -41,13 +41,13 @@ def descent(
     value, gradient = function(x)
     pairs: list[tuple[Array, Array, float]] = []
     evaluations, first = 1, True
-    while np.abs(gradient).max(initial=0.0) > LEAST_GRADIENT and evaluations <= most_evaluations:
+    while np.abs(gradient).max(initial=0.0) > MIN_GRADIENT and evaluations <= most_evaluations:
         direction = -_product(pairs, gradient)
         slope = _dot(direction, gradient)
         search = LineSearch(
             value, slope, 1.0 / math.sqrt(_dot(direction, direction)) if first else 1.0
         )
-        while slope < 0.0 and not search.ended and search.count < SEARCHES:
+        while slope < 0.0 and not search.ended and search.count < MAX_LINE_SEARCH_STEPS:
             there = x + search.step * direction
             found, changed = function(there)
             evaluations += 1
@@ -65,7 +65,7 @@ def descent(
         fall = value - found
         x, value, gradient = there, found, changed
         yield x, value
-        if fall <= LEAST_FALL * max(abs(value + fall), abs(value), 1.0):
+        if fall <= MIN_DECREASE * max(abs(value + fall), abs(value), 1.0):
             return
 
 
@@ -115,7 +115,7 @@ class LineSearch:
         self._start = self._best = self._other = _At(0.0, value, slope)
         self._bracketed, self._modified = False, True
         self._range = (0.0, 5.0 * step)
-        self._width, self._before = LARGEST_STEP, 2.0 * LARGEST_STEP
+        self._width, self._before = MAX_STEP, 2.0 * MAX_STEP
 
     def advance(self, value: float, slope: float) -> None:
         """Advances the search with the value and the slope at `step`."""
@@ -126,8 +126,8 @@ class LineSearch:
         if self._modified and lower and here.slope >= 0.0:
             self._modified = False
         flat = abs(slope) <= CURVATURE * -self._start.slope
-        stuck = self._bracketed and (not low < here.step < high or high - low <= NARROW * high)
-        at_end = here.step == LARGEST_STEP and lower and here.slope <= test
+        stuck = self._bracketed and (not low < here.step < high or high - low <= MIN_BRACKET * high)
+        at_end = here.step == MAX_STEP and lower and here.slope <= test
         if (lower and flat) or stuck or at_end:
             # L-BFGS also accepts the last step of a search that cannot continue.
             self.found = self.ended = True
@@ -150,8 +150,8 @@ class LineSearch:
             low, high = min(x, y), max(x, y)
         else:
             low, high = step + 1.1 * (step - x), step + 4.0 * (step - x)
-        step = min(max(step, 0.0), LARGEST_STEP)
-        if self._bracketed and (not low < step < high or high - low <= NARROW * high):
+        step = min(max(step, 0.0), MAX_STEP)
+        if self._bracketed and (not low < step < high or high - low <= MIN_BRACKET * high):
             step = x
         self.step, self._range = step, (low, high)
 

@@ -31,7 +31,7 @@ from hmt_ros.inference.linear_algebra import (
 )
 
 # Maximum number of intervals whose transitions are cached.
-MOST_INTERVALS = 64
+MAX_INTERVALS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,12 +202,12 @@ class LinearGaussianDynamics:
                 part.setflags(write=False)
             return found
 
-        return lru_cache(MOST_INTERVALS)(made)
+        return lru_cache(MAX_INTERVALS)(made)
 
     @cached_property
     def coupling(self) -> Callable[[float], tuple[Array, Array, Array, float]]:
         """Function that returns A' Q^-1 A, Q^-1 and Q^-1 A, (n, n), and log |Q|; cached."""
-        return lru_cache(MOST_INTERVALS)(self._coupling)
+        return lru_cache(MAX_INTERVALS)(self._coupling)
 
     def _coupling(self, interval: float) -> tuple[Array, Array, Array, float]:
         a, q = self.transition(interval)

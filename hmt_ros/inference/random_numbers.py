@@ -8,9 +8,9 @@ from hmt_ros.inference.arrays import Array
 
 # End of the ziggurat of numpy's normal numbers. Beyond it, numpy calls the logarithm of the C
 # library, which depends on the processor.
-_END = 3.6541528853610088
+_ZIGGURAT_END = 3.6541528853610088
 
 
 def standard_normals(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
-    """Draw standard normal numbers, clipped at +-`_END`, which affects 3 of 10 000."""
-    return np.clip(rng.standard_normal(shape), -_END, _END)
+    """Draw standard normal numbers, clipped at +-`_ZIGGURAT_END`, which affects 3 of 10 000."""
+    return np.clip(rng.standard_normal(shape), -_ZIGGURAT_END, _ZIGGURAT_END)

@@ -35,7 +35,7 @@ from hmt_ros.inference.linear_algebra import (
 from hmt_ros.inference.mixture import GaussianMixture
 
 # Share of the weight below which `reduced` drops a component.
-NEGLIGIBLE = 1e-8
+NEGLIGIBLE_WEIGHT = 1e-8
 
 
 def merged(mixture: GaussianMixture, share: Array) -> GaussianMixture:
@@ -148,7 +148,7 @@ def reduced(mixture: GaussianMixture, count: int, iterations: int = 10) -> Gauss
     mixture = mixture.normalised()
     if len(mixture) <= count:
         return mixture
-    large = mixture[mixture.weights > NEGLIGIBLE].normalised()
+    large = mixture[mixture.weights > NEGLIGIBLE_WEIGHT].normalised()
     if len(large) <= count:
         return large
     starts = clustered(large, count), merged_pairwise(large, count)

@@ -14,14 +14,14 @@ from itertools import pairwise
 from typing import Any
 
 # Maximum number of threads.
-MOST_THREADS = 8
-_most = MOST_THREADS
+MAX_THREADS = 8
+_most = MAX_THREADS
 
 
 def limit_threads(count: int) -> None:
     """Cap the number of worker threads of this process."""
     global _most
-    _most = min(count, MOST_THREADS)
+    _most = min(count, MAX_THREADS)
 
 
 def in_threads(
@@ -32,7 +32,7 @@ def in_threads(
     Args:
         work: function that processes the items from a first index up to an end index.
         least: minimum number of items per thread.
-        threads: maximum number of threads; 0: one per core, up to `MOST_THREADS`, with one core
+        threads: maximum number of threads; 0: one per core, up to `MAX_THREADS`, with one core
             left for other processes such as a camera or a smoother.
     """
     threads = min(threads or _cores(), _most, count // least)
@@ -64,7 +64,7 @@ def together(calls: Sequence[Callable[[], Any]], threads: int = 0) -> list[Any]:
 
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(MOST_THREADS, thread_name_prefix='hmt_ros')
+    return ThreadPoolExecutor(MAX_THREADS, thread_name_prefix='hmt_ros')
 
 
 # A forked child process inherits the pool without its threads.

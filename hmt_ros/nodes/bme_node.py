@@ -12,7 +12,7 @@ from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import (
     CAMERA_INFO_TOPIC,
-    RELIABLE,
+    RELIABLE_QOS,
     SubscribedTopic,
     image_topic,
     input_topics,
@@ -39,7 +39,7 @@ class BmeNode(SessionNode[BmeSession, BmeParameters]):
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
         yield CAMERA_INFO_TOPIC
         if self._settings.tracked_interval > 0:
-            yield SubscribedTopic(TRACK, TRACK, 'hmt_msgs/msg/PoseMixture', RELIABLE)
+            yield SubscribedTopic(TRACK, TRACK, 'hmt_msgs/msg/PoseMixture', RELIABLE_QOS)
         assert self._session is not None
         yield from input_topics(self._session.rows)
         if self._settings.predict_from != FROM_KEYPOINTS:

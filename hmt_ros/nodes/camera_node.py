@@ -38,7 +38,7 @@ from hmt_ros.sessions.camera_file import camera_of_view, read_camera
 from hmt_ros.sessions.declared_parameters import AT_LAUNCH, parameter_field
 from hmt_ros.sessions.focal_length import USUAL_FOV, usual_camera
 from msg_tools import RosbagsMessages
-from msg_tools.files.display_matrix import STORED, display_matrix, is_mirrored
+from msg_tools.files.display_matrix import IDENTITY, display_matrix, is_mirrored
 from msg_tools.files.error_line import error_line
 from msg_tools.files.video_file import open_video
 from msg_tools.messages.camera_info import camera_info_message
@@ -52,13 +52,13 @@ FRAME_ID = 'camera_optical_frame'
 _USUAL_RATE = 30.0
 # Time without an image after which a device counts as unplugged, and interval between attempts to
 # open it again, s.
-_PATIENCE, _REOPENED = 5.0, 1.0
-_GLANCE, _CONNECTING = 0.05, 0.5
+_UNPLUGGED_TIME, _REOPENING_INTERVAL = 5.0, 1.0
+_POLLING_PERIOD, _CONNECTION_TIME = 0.05, 0.5
 # Time limit for an active node to be discovered as subscriber, s: participants announce themselves
 # every 3 s.
-_SUBSCRIBING = 5.0
+_DISCOVERY_TIME = 5.0
 # Interval between reports on nodes that are not active yet, s.
-_AGAIN = 10.0
+_REPORT_INTERVAL = 10.0
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Video:
             raise ValueError(
                 f'{source} can not be opened; wanted a webcam that no other program uses'
             )
-        if self.is_file and is_mirrored(display_matrix(Path(source)) or STORED):
+        if self.is_file and is_mirrored(display_matrix(Path(source)) or IDENTITY):
             # OpenCV would turn mirrored images by 180 degrees.
             raise ValueError(
                 f'{source}: its metadata mirror the images; convert it with ffmpeg -i {source} '
@@ -140,19 +140,19 @@ class Video:
                 self._capture.open(self._source)
             elif self.is_file:
                 return
-            elif time.monotonic() - seen > _PATIENCE:
+            elif time.monotonic() - seen > _UNPLUGGED_TIME:
                 if not gone:
                     warn(
-                        f'{self._source} has given no image for {_PATIENCE:g} s: is it plugged '
-                        'in, and not used by another program? The node continues as soon as it '
-                        'is back'
+                        f'{self._source} has given no image for {_UNPLUGGED_TIME:g} s: is it '
+                        'plugged in, and not used by another program? The node continues as '
+                        'soon as it is back'
                     )
                     gone = True
                 self._capture.release()
-                stopped.wait(_REOPENED)
+                stopped.wait(_REOPENING_INTERVAL)
                 self._capture.open(self._device)
             else:
-                stopped.wait(_GLANCE)
+                stopped.wait(_POLLING_PERIOD)
 
     def close(self) -> None:
         """Releases the device."""
@@ -223,20 +223,20 @@ def _await_active(node: Any, names: list[str], stopped: threading.Event) -> None
             if not client.service_is_ready():
                 continue
             answer = client.call_async(GetState.Request())
-            rclpy.spin_until_future_complete(node, answer, timeout_sec=_CONNECTING)
+            rclpy.spin_until_future_complete(node, answer, timeout_sec=_CONNECTION_TIME)
             if answer.done() and answer.result().current_state.id == State.PRIMARY_STATE_ACTIVE:
                 node.destroy_client(clients.pop(name))
-        if time.monotonic() - told > _AGAIN:
+        if time.monotonic() - told > _REPORT_INTERVAL:
             told = time.monotonic()
             node.get_logger().info(f'not active yet: {", ".join(clients)}; see "ros2 node list"')
-        stopped.wait(_GLANCE)
+        stopped.wait(_POLLING_PERIOD)
 
 
 def _await_subscriber(node: Any, images: Any, stopped: threading.Event, patience: float) -> None:
     """Waits for a subscriber to the images, for at most `patience` s, or until stopped."""
     end = time.monotonic() + patience
     while not images.get_subscription_count() and not stopped.is_set() and time.monotonic() < end:
-        rclpy.spin_once(node, timeout_sec=_GLANCE)
+        rclpy.spin_once(node, timeout_sec=_POLLING_PERIOD)
 
 
 def _show(
@@ -254,13 +254,13 @@ def _show(
     if video.is_file and wait_for:
         node.get_logger().info(f'{given.video} starts when active: {", ".join(wait_for)}')
         _await_active(node, wait_for, stopped)
-        _await_subscriber(node, images, stopped, _SUBSCRIBING)
+        _await_subscriber(node, images, stopped, _DISCOVERY_TIME)
     elif video.is_file and not images.get_subscription_count():
         node.get_logger().info(f'{given.video} starts when somebody subscribes to {images.topic}')
         _await_subscriber(node, images, stopped, math.inf)
     if video.is_file:
         # The subscriber may not have discovered the publisher yet.
-        stopped.wait(_CONNECTING)
+        stopped.wait(_CONNECTION_TIME)
     camera, messages, count, first = None, RosbagsMessages(), 0, 0
     for image, due in video.images(stopped, node.get_logger().warn):
         if due is None or camera is None:

@@ -20,7 +20,7 @@ from hmt_ros.nodes.estimating_thread import Duration
 from hmt_ros.nodes.silent_topics import SilentTopics
 from hmt_ros.sessions.session import SessionState
 
-_LOST = 'messages lost'
+_LOST_MESSAGES_KEY = 'messages lost'
 
 
 class Rates:
@@ -128,7 +128,7 @@ class MiddlewareEvents:
         def lost(event: Any) -> None:
             count = event.total_count_change
             text = f'{topic}: {count} messages were lost on their way'
-            self._count(f'{_LOST} of {topic}', count, text)
+            self._count(f'{_LOST_MESSAGES_KEY} of {topic}', count, text)
 
         callbacks = self._misfits(
             topic,
@@ -185,12 +185,15 @@ class MiddlewareEvents:
     def lost(self) -> int:
         """Number of messages lost so far, over all topics."""
         counts = dict(self._counts)
-        return sum(count for what, count in counts.items() if what.startswith(_LOST))
+        return sum(count for what, count in counts.items() if what.startswith(_LOST_MESSAGES_KEY))
 
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
         counts = sorted(dict(self._counts).items())
-        return [(_LOST, str(self.lost)), *((what, str(count)) for what, count in counts)]
+        return [
+            (_LOST_MESSAGES_KEY, str(self.lost)),
+            *((what, str(count)) for what, count in counts),
+        ]
 
     def forget(self) -> None:
         """Forgets incompatible publishers; those that still exist are found again."""

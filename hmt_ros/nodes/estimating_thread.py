@@ -6,7 +6,7 @@ whose other inputs have all arrived. Only older images are dropped.
 
 The sessions that contribute to a pose share one thread and take turns, in the order in which they
 use each other's results. Sessions that can wait for the pose have a second thread, which handles a
-message when the first one is idle, or once the message has waited for `LONGEST_WAIT`. The messages
+message when the first one is idle, or once the message has waited for `MAX_WAIT`. The messages
 of a session keep their order, so its results do not depend on turns.
 """
 
@@ -31,14 +31,14 @@ from msg_tools.messages.headers import stamp_in
 from msg_tools.messages.images import decode_image
 
 # Maximum time that a message of the second thread waits for the first thread to be idle, s.
-LONGEST_WAIT = 0.1
+MAX_WAIT = 0.1
 # Number of recently decoded images that the sessions of a process share.
-SHARED = 4
+MAX_SHARED_IMAGES = 4
 _RESTART = 'restart'
 # Maximum number of recently dropped images that are reported singly; others are only counted.
-_ANSWERED = 100
+_MAX_REPORTED_DROPS = 100
 # Maximum number of images whose arrival times are remembered, to measure the latency.
-_REMEMBERED = 1000
+_MAX_ARRIVAL_TIMES = 1000
 
 
 class Waiting(NamedTuple):
@@ -118,7 +118,7 @@ class InputQueue:
         self._waiting: deque[Waiting] = deque()
         self._sizes: Counter[str] = Counter()
         self._dropped = 0
-        self._dropped_stamps: deque[int] = deque(maxlen=_ANSWERED)
+        self._dropped_stamps: deque[int] = deque(maxlen=_MAX_REPORTED_DROPS)
         self._closed = False
         self._changed = changed or threading.Condition()
 
@@ -228,12 +228,12 @@ class EstimatingThread:
                 if ready:
                     self._busy = next((one for one in ready if one.place > last), ready[0])
                     return self._busy
-                self.changed.wait(None if self._after is None else LONGEST_WAIT / 2)
+                self.changed.wait(None if self._after is None else MAX_WAIT / 2)
             self._thread = None
             return None
 
     def _may_begin(self, estimator: Estimator) -> bool:
-        if self._after is None or time.monotonic() - estimator.queue.since > LONGEST_WAIT:
+        if self._after is None or time.monotonic() - estimator.queue.since > MAX_WAIT:
             return True
         return self._after._busy is None and not any(len(x.queue) for x in self._after._served)
 
@@ -252,7 +252,7 @@ class EstimatingThreads:
         self.poses = EstimatingThread(changed)
         self.later = EstimatingThread(changed, after=self.poses)
         self.seen_images = SeenImages()
-        self._pictures: deque[tuple[Any, Image]] = deque(maxlen=SHARED)
+        self._pictures: deque[tuple[Any, Image]] = deque(maxlen=MAX_SHARED_IMAGES)
 
     def decode(self, message: Any) -> Image:
         """The pixels of an image message, see `decode_image`; decoded once for all sessions."""
@@ -273,9 +273,9 @@ class Estimator:
         session: session to run; only the thread uses it, until `stop` has returned True.
         thread: thread that runs the estimator.
         place: rank of the estimator in the order in which the thread gives turns.
-        tell: function that receives the report on each message.
-        tell_change: function that is called when status or kinds of faults of the session change.
-        tell_error: function that receives an unexpected error of the session, and returns a line
+        report: function that receives the report on each message.
+        report_change: function that is called when status or kinds of faults of the session change.
+        report_error: function that receives an unexpected error of the session, and returns a line
             that names it.
 
     Attributes:
@@ -288,9 +288,9 @@ class Estimator:
         thread: EstimatingThread,
         *,
         place: int,
-        tell: Callable[[Handled], None],
-        tell_change: Callable[[], None],
-        tell_error: Callable[[Exception], str],
+        report: Callable[[Handled], None],
+        report_change: Callable[[], None],
+        report_error: Callable[[Exception], str],
     ) -> None:
         self._session, self._thread = session, thread
         self.place = place
@@ -298,7 +298,11 @@ class Estimator:
         limits = {_RESTART: 1, session.COUNTED: session.most_waiting}
         self.queue = InputQueue(limits, session.COUNTED, thread.changed)
         session.interrupted = lambda: bool(len(self.queue))
-        self._tell, self._tell_change, self._tell_error = tell, tell_change, tell_error
+        self._report_handled, self._tell_change, self._describe_error = (
+            report,
+            report_change,
+            report_error,
+        )
         self._durations: deque[Duration] = deque(maxlen=1000)
         self._arrivals: dict[int, float] = {}
         thread.serve(self)
@@ -341,7 +345,7 @@ class Estimator:
         session = self._session
         session.count_dropped(arrived.dropped - len(arrived.stamps_ns))
         for stamp in arrived.stamps_ns:
-            self._tell(session.drop(stamp))
+            self._report_handled(session.drop(stamp))
         following = [waiting.source for waiting in arrived.waiting[1:]]
         for waiting, after in zip(arrived.waiting, [*following, _RESTART], strict=True):
             self._try_to_handle(waiting, more=after != _RESTART)
@@ -353,8 +357,8 @@ class Estimator:
             self._handle(waiting, more=more)
         except Exception as error:  # noqa: BLE001
             # An internal error must not affect later messages.
-            text = f'the node itself failed: {self._tell_error(error)}'
-            self._tell(session.break_off(waiting.source, text))
+            text = f'the node itself failed: {self._describe_error(error)}'
+            self._report_handled(session.break_off(waiting.source, text))
         after = session.state
         if (after.status, after.faults.keys()) != (before.status, before.faults.keys()):
             self._tell_change()
@@ -367,7 +371,7 @@ class Estimator:
         done, publishing = session.state.counts[session.DONE], session.publishing
         if kind_of(waiting.source) == session.COUNTED:
             self._arrivals[waiting.stamp_ns] = waiting.arrival
-            if len(self._arrivals) > _REMEMBERED:
+            if len(self._arrivals) > _MAX_ARRIVAL_TIMES:
                 del self._arrivals[next(iter(self._arrivals))]
         try:
             message = waiting.content()
@@ -385,4 +389,4 @@ class Estimator:
             now = time.monotonic()
             published = (session.publishing - publishing) / more_done
             self._durations.append(Duration(now - arrival, (now - began) / more_done, published))
-        self._tell(handled)
+        self._report_handled(handled)

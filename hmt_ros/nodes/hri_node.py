@@ -39,8 +39,8 @@ from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
 _URDF = 'urdf'
 # Maximum number of subscribed topics, and period of the search for people, s.
-_MOST_TOPICS = 64
-_SEARCH = 0.25
+_MAX_TOPICS = 64
+_SEARCH_PERIOD = 0.25
 
 
 class HriNode(SessionNode[HriSession, HriParameters]):
@@ -59,7 +59,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
         # Publishers of bodies, by topic. Only the estimating thread uses them.
         self._of_bodies: dict[str, Any] = {}
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._search = self.create_timer(_SEARCH, self._look_for_people, clock=steady)
+        self._search = self.create_timer(_SEARCH_PERIOD, self._find_people, clock=steady)
 
     def _messages_of_others(self, settings: HriParameters) -> Mapping[str, str]:
         return {IDS: 'hri_node'}
@@ -75,7 +75,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Subscribes to the inputs and searches for people."""
         result = super().on_activate(state)
-        self._look_for_people()
+        self._find_people()
         return result
 
     # Subscriptions to people.
@@ -93,20 +93,20 @@ class HriNode(SessionNode[HriSession, HriParameters]):
             if topic.startswith(f'{BODIES}/') and topic.endswith(end) and POSE_MIXTURE in kinds
         )
 
-    def _look_for_people(self) -> None:
+    def _find_people(self) -> None:
         if self._estimator is None or self._settings.named or not self._heard:
             return
         end = f'/{self._settings.mixture_topic}'
         for name, subscription in list(self._connected.items()):
             if name.endswith(end) and not subscription.get_publisher_count():
-                self._leave(name)
+                self._hand_over(name)
         for namespace in self._found():
             one = self._mixtures_in(namespace)
             if self._local_name(one.topic) in self._heard:
                 continue
-            if len(self._heard) >= _MOST_TOPICS:
+            if len(self._heard) >= _MAX_TOPICS:
                 self.get_logger().warn(
-                    f'the limit of {_MOST_TOPICS} subscribed topics is reached: mixtures in '
+                    f'the limit of {_MAX_TOPICS} subscribed topics is reached: mixtures in '
                     f'{namespace} are ignored; name those to use in the parameter namespaces',
                     once=True,
                 )
@@ -144,8 +144,8 @@ class HriNode(SessionNode[HriSession, HriParameters]):
     def _is_wanted(self, topic: str) -> bool:
         return bool(self._publisher_of(topic).get_subscription_count())
 
-    def _tell(self, handled: Handled) -> None:
-        super()._tell(handled)
+    def _report_handled(self, handled: Handled) -> None:
+        super()._report_handled(handled)
         session = self._session
         self._forget_bodies(set() if session is None else session.identities)
 

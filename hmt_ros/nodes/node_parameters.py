@@ -30,12 +30,12 @@ from hmt_ros.sessions.declared_parameters import (
     values_of,
     with_values,
 )
-from hmt_ros.sessions.parameter_file import LARGEST_FILE, PARAMETERS_KEY
+from hmt_ros.sessions.parameter_file import MAX_FILE_BYTES, PARAMETERS_KEY
 from msg_tools.files.plain_yaml import read_plain_yaml
 
 QOS_OVERRIDES = 'qos_overrides.'
 # Minimum similarity of a name to a suggestion; larger for nodes, whose names are similar.
-_ALIKE, _ALIKE_NODE = 0.5, 0.8
+_MIN_SIMILARITY, _MIN_NODE_SIMILARITY = 0.5, 0.8
 
 
 def declare(node: Node, defaults: Settings) -> Settings:
@@ -122,7 +122,7 @@ def unknown_parameters(given: Iterable[str], known: Iterable[str]) -> list[str]:
     names = sorted(known)
     texts = []
     for name in sorted(set(given) - set(names)):
-        near = difflib.get_close_matches(name, names, n=1, cutoff=_ALIKE)
+        near = difflib.get_close_matches(name, names, n=1, cutoff=_MIN_SIMILARITY)
         hint = f'; did you mean {near[0]!r}?' if near else ', it is ignored'
         texts.append(f'unknown parameter {name!r}{hint}')
     return texts
@@ -163,7 +163,7 @@ def files_for_others(arguments: Iterable[str], node: str) -> list[str]:
         if option != '--params-file':
             continue
         try:
-            document = read_plain_yaml(Path(path), LARGEST_FILE)
+            document = read_plain_yaml(Path(path), MAX_FILE_BYTES)
         except ValueError:
             # ROS accepted this file, so it is valid YAML, but not in the plain subset.
             continue
@@ -172,7 +172,7 @@ def files_for_others(arguments: Iterable[str], node: str) -> list[str]:
             continue
         own = node.rpartition('/')[2]
         named = {section.rpartition('/')[2]: section for section in sections}
-        near = difflib.get_close_matches(own, named, n=1, cutoff=_ALIKE_NODE)
+        near = difflib.get_close_matches(own, named, n=1, cutoff=_MIN_NODE_SIMILARITY)
         if near:
             texts.append(
                 f'{path}: its parameters are for {named[near[0]]!r}, and this node is {node!r}: '

@@ -7,7 +7,7 @@ from collections import deque
 
 # Maximum number of messages that may still return; the oldest are dropped, as some middleware
 # returns none.
-_MOST_OWN = 1000
+_MAX_OWN_MESSAGES = 1000
 
 
 class OwnMessages:
@@ -15,7 +15,7 @@ class OwnMessages:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._waiting: deque[bytes] = deque(maxlen=_MOST_OWN)
+        self._waiting: deque[bytes] = deque(maxlen=_MAX_OWN_MESSAGES)
 
     def sent(self, data: bytes) -> None:
         """Records a message, as CDR bytes, before it is published."""

@@ -14,8 +14,8 @@ from typing import Any
 
 # Maximum time that a node waits for a reader, s, and maximum fraction of its time that it spends
 # waiting, so that many requests do not block it.
-LONGEST_WAIT, SHARE = 0.6, 0.5
-_GLANCE = 0.01
+MAX_WAIT, MAX_TIME_SHARE = 0.6, 0.5
+_POLLING_PERIOD = 0.01
 
 
 class PatientReader:
@@ -25,7 +25,7 @@ class PatientReader:
         # The present request and its result.
         self._asked: tuple[Any, Future[None]] | None = None
         # Remaining time that the node may wait, s, and the time of its last update, s.
-        self._left, self._since = LONGEST_WAIT, time.monotonic()
+        self._left, self._since = MAX_WAIT, time.monotonic()
 
     def read(self, of: Any, action: Callable[[], Any], meanwhile: Callable[[], None]) -> None:
         """Reads files.
@@ -47,9 +47,9 @@ class PatientReader:
         if asked != of:
             raise ValueError('other files are still being read: ask again later')
         began = time.monotonic()
-        end = began + min(self._left + SHARE * (began - self._since), LONGEST_WAIT)
+        end = began + min(self._left + MAX_TIME_SHARE * (began - self._since), MAX_WAIT)
         while not result.done() and (rest := end - time.monotonic()) > 0.0:
-            wait([result], min(rest, _GLANCE))
+            wait([result], min(rest, _POLLING_PERIOD))
             meanwhile()
         self._left, self._since = max(end - time.monotonic(), 0.0), began
         if not result.done():

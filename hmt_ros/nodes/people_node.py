@@ -24,7 +24,7 @@ from hmt_ros.sessions.tracking_parameters import PeopleParameters
 
 # Number of diagnostics periods from the end of a track until the topics of the person close: the
 # last messages must still arrive.
-STAYS_OPEN = 5
+CLOSING_PERIODS = 5
 
 
 class PeopleNode(TrackingNode):
@@ -79,7 +79,9 @@ class PeopleNode(TrackingNode):
         followed = set() if self._session is None else set(self._session.state.followed)
         open_now = {name for topic in self._outputs if (name := person_of(topic))}
         self._left = {name: self._left.get(name, 0) + 1 for name in open_now - followed}
-        self._close_topics({name for name, periods in self._left.items() if periods >= STAYS_OPEN})
+        self._close_topics(
+            {name for name, periods in self._left.items() if periods >= CLOSING_PERIODS}
+        )
 
     def _close_topics(self, people: set[str]) -> None:
         """Closes the topics of people who have left."""

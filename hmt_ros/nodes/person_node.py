@@ -26,17 +26,17 @@ NODES: Mapping[str, type[SessionNode[Any, Any]]] = {
     node.NAME: node for node in (FilterNode, SmootherNode, BmeNode, KeypointsNode)
 }
 # Nodes in the order in which they take turns.
-_ORDER = (KeypointsNode.NAME, BmeNode.NAME, FilterNode.NAME, SmootherNode.NAME)
-USUAL = (FilterNode.NAME, SmootherNode.NAME, BmeNode.NAME)
+_TURN_ORDER = (KeypointsNode.NAME, BmeNode.NAME, FilterNode.NAME, SmootherNode.NAME)
+USUAL_NODES = (FilterNode.NAME, SmootherNode.NAME, BmeNode.NAME)
 # Interval between two predictions while the filter tracks the person, s.
 TRACKED_INTERVAL = 0.2
-_RENAMED = ('__node:=', '__name:=')
+_RENAMING_RULES = ('__node:=', '__name:=')
 _USAGE = f"""usage: ros2 run hmt_ros {NAME} [NODE ...] [--ros-args ...]
 
 Filter, smoother, experts and a detector in one process.
 
 Each NODE is one of {', '.join(NODES)};
-by default these run: {', '.join(USUAL)}. Their names, parameters, topics and
+by default these run: {', '.join(USUAL_NODES)}. Their names, parameters, topics and
 services are the same as in separate processes: see "ros2 run hmt_ros NODE --help".
 The filter uses the predictions of bme_node, and the keypoints of a detector, if these run.
 """
@@ -66,7 +66,7 @@ def nodes_together(names: Sequence[str], **options: Any) -> list[SessionNode[Any
     """
     values = used_of_each_other(names)
     nodes: list[SessionNode[Any, Any]] = []
-    for name in sorted(names, key=_ORDER.index):
+    for name in sorted(names, key=_TURN_ORDER.index):
         defaults = replace(NODES[name].DEFAULTS, **values[name])
         nodes.append(NODES[name](defaults, nodes[0] if nodes else None, **options))
     return nodes
@@ -79,12 +79,12 @@ def main(args: list[str] | None = None) -> int:
         sys.stdout.write(_USAGE)
         return 0
     own = arguments[: arguments.index('--ros-args')] if '--ros-args' in arguments else arguments
-    names = tuple(dict.fromkeys(own)) or USUAL
+    names = tuple(dict.fromkeys(own)) or USUAL_NODES
     unknown = [name for name in names if name not in NODES]
     if unknown:
         sys.stderr.write(f'{NAME}: wanted some of {", ".join(NODES)}, saw {unknown[0]!r}\n')
         return 2
-    renamed = [word for word in arguments if word.startswith(_RENAMED)]
+    renamed = [word for word in arguments if word.startswith(_RENAMING_RULES)]
     if renamed:
         sys.stderr.write(
             f'{NAME}: {renamed[0]} would give all nodes one name; wanted none, or '

@@ -28,7 +28,7 @@ from hmt_ros.sessions.parameter_file import yaml_scalar
 from msg_tools.files.error_line import error_line
 
 # Environment variable with the id of the parent process; a node ends when that process ends.
-OWNER = 'HMT_ROS_OWNER'
+OWNER_VARIABLE = 'HMT_ROS_OWNER'
 
 # Parameter of mallopt(3) for the maximum number of heaps.
 _ARENA_MAX = -8
@@ -36,7 +36,7 @@ _ARENA_MAX = -8
 # thread would delay the others by this time after each of their calls of compiled code.
 _SWITCH_INTERVAL = 0.0005
 # Maximum time that a stopping node waits for its last estimate, s.
-_LAST_ESTIMATE = 5.0
+_LAST_ESTIMATE_TIME = 5.0
 _WIDTH = 100
 _TYPES = {bool: 'bool', int: 'int', float: 'float', str: 'string', tuple: 'list of floats'}
 
@@ -81,10 +81,10 @@ def run_together(
     for node in nodes:
         node.start()
     # If the parent process is killed, it can not stop the node, which then ends by itself.
-    owner = os.environ.get(OWNER)
+    owner = os.environ.get(OWNER_VARIABLE)
     while not stopped.is_set() and owner in (None, str(os.getppid())):
         _spin_once(executor, nodes)
-    end = time.monotonic() + _LAST_ESTIMATE
+    end = time.monotonic() + _LAST_ESTIMATE_TIME
     ended = [node.stop(max(end - time.monotonic(), 0.0)) for node in nodes]
     if not all(ended):
         sys.stderr.flush()

@@ -51,8 +51,8 @@ from hmt_ros.nodes.own_messages import OwnMessages
 from hmt_ros.nodes.patient_reader import PatientReader
 from hmt_ros.nodes.silent_topics import SilentTopics
 from hmt_ros.nodes.subscribed_topic import (
-    ANSWERS,
-    RELIABLE,
+    HANDLED_QOS,
+    RELIABLE_QOS,
     SubscribedTopic,
     message_class,
     published_with,
@@ -64,8 +64,8 @@ from hmt_ros.sessions.declared_parameters import (
     with_values,
 )
 from hmt_ros.sessions.handled import HANDLED, Handled, Output, handled_message
-from hmt_ros.sessions.named_file import FILES, check_place, public_line
-from hmt_ros.sessions.session import SUBSCRIBERS, Session, SessionState
+from hmt_ros.sessions.named_file import FILE_PARAMETERS, check_place, public_line
+from hmt_ros.sessions.session import SUBSCRIBERS_KEY, Session, SessionState
 from msg_tools import RosbagsMessages
 from msg_tools.files.error_line import error_line, one_line
 from msg_tools.messages.cdr import serialise
@@ -75,9 +75,9 @@ Parameters = TypeVar('Parameters', bound=NodeParameters)
 # Number of diagnostics periods between two console lines with the same status.
 QUIET_PERIODS = 10
 # Time for which the diagnostics report a backward jump of the clock, s.
-ALARM = 5.0
+TIME_JUMP_ALARM_TIME = 5.0
 # Maximum number of parameters in one request; each takes a fraction of a millisecond.
-MOST_PARAMETERS = 256
+MAX_PARAMETERS = 256
 
 
 class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
@@ -156,7 +156,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._diagnostics = self.create_publisher(
             DiagnosticArray,
             '/diagnostics',
-            RELIABLE,
+            RELIABLE_QOS,
             event_callbacks=self._events.of_publisher('/diagnostics'),
         )
         # Diagnostics must also run with use_sim_time when nobody publishes a clock.
@@ -257,7 +257,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         for topic in self._offered_topics():
             published = published_with(self.SESSION.TOPICS[topic])
             self._outputs[topic] = self._new_publisher(topic, *published)
-        self._handled = self._new_publisher('~/handled', HANDLED, ANSWERS)
+        self._handled = self._new_publisher('~/handled', HANDLED, HANDLED_QOS)
         self._offered = [
             self.create_service(kind, name, partial(self._serve, callback))
             for kind, name, callback in self._offered_services()
@@ -273,9 +273,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             session,
             self._threads.later if self.CAN_WAIT else self._threads.poses,
             place=self._nodes.index(self),
-            tell=self._tell,
-            tell_change=self._diagnose,
-            tell_error=self._tell_error,
+            report=self._report_handled,
+            report_change=self._diagnose,
+            report_error=self._describe_error,
         )
         session.topic_names = {one.source: self.resolve_topic_name(one.topic) for one in inputs}
         self._silent.listen(inputs, self.SESSION.COUNTED)
@@ -292,7 +292,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._unsubscribe()
         self.stop()
         if self._session is not None:
-            self._tell(self._session.finish())
+            self._report_handled(self._session.finish())
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -319,7 +319,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             if wanted.topic not in self._outputs or not self._own.is_own(data):
                 waiting = received(data, wanted)
                 for one in self._listeners(name):
-                    one._hear(name, waiting)
+                    one._enqueue(name, waiting)
 
         self._connected[name] = self.create_subscription(
             message_class(wanted.msgtype),
@@ -331,7 +331,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
 
-    def _leave(self, name: str) -> None:
+    def _hand_over(self, name: str) -> None:
         """Unsubscribes from a topic; the next listening node of the process subscribes to it."""
         del self._heard[name]
         if (subscription := self._connected.pop(name, None)) is None:
@@ -344,7 +344,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         """The nodes of this process that listen to a topic."""
         return [one for one in self._nodes if name in one._heard]
 
-    def _hear(self, name: str, waiting: Waiting) -> None:
+    def _enqueue(self, name: str, waiting: Waiting) -> None:
         """Queues a message of a topic. Thread-safe."""
         wanted, estimator = self._heard.get(name), self._estimator
         if wanted is not None and estimator is not None:
@@ -353,7 +353,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
 
     def _unsubscribe(self) -> None:
         for name in list(self._heard):
-            self._leave(name)
+            self._hand_over(name)
         self._events.forget()
         self._silent.listen(())
 
@@ -376,8 +376,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         """Calls the callback of a service; if it fails, refuses the request with the reason."""
         asked = getattr(request, 'parameters', ())
         try:
-            if len(asked) > MOST_PARAMETERS:
-                raise ValueError(f'{len(asked)} parameters, the limit is {MOST_PARAMETERS}')
+            if len(asked) > MAX_PARAMETERS:
+                raise ValueError(f'{len(asked)} parameters, the limit is {MAX_PARAMETERS}')
             response = callback(request, response)
         except Exception as error:  # noqa: BLE001
             what, text = 'a request is refused', public_line(error)
@@ -427,7 +427,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             ValueError: a file can not be used, or must not be read by a running node.
         """
         launched, values = values_of(self._at_launch), values_of(settings)
-        for name in FILES:
+        for name in FILE_PARAMETERS:
             if values.get(name, '') != launched.get(name, ''):
                 check_place(name, values[name], self._folders)
         self._new_session(settings, lambda output: None)
@@ -441,7 +441,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
 
     # Called by the thread that estimates.
 
-    def _tell(self, handled: Handled) -> None:
+    def _report_handled(self, handled: Handled) -> None:
         for text in handled.events:
             self.get_logger().info(text)
         for text in handled.warnings:
@@ -449,7 +449,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         if self._handled.get_subscription_count():
             self._handled.publish(serialise(handled_message(RosbagsMessages(), handled)))
 
-    def _tell_error(self, error: Exception) -> str:
+    def _describe_error(self, error: Exception) -> str:
         self._errors += 1
         self._last_error = f'{type(error).__name__}: {error_line(error)}'
         self.get_logger().error(f'{self._last_error}; --log-level debug shows where')
@@ -465,7 +465,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         if not inside or publisher.get_subscription_count():
             publisher.publish(output.data)
         for one in inside:
-            one._hear(name, Waiting('', lambda: output.message, time.monotonic(), output.stamp_ns))
+            one._enqueue(
+                name, Waiting('', lambda: output.message, time.monotonic(), output.stamp_ns)
+            )
 
     def _is_wanted(self, topic: str) -> bool:
         return bool(self._subscribers(topic))
@@ -501,7 +503,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         waiting = 0 if estimator is None else len(estimator.queue)
         self._rates.next_period(counts, durations, waiting)
         if self._session is not None and self._heard:
-            self._silent.look(self._session.needed_inputs())
+            self._silent.check(self._session.needed_inputs())
         self._diagnose()
         self._log_status(counts)
 
@@ -515,10 +517,10 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             return
         self._told_status, self._untold = state.status, 0
         label = self._state_machine.current_state[1]
-        _, text = self._judgement(label, state)
+        _, text = self._status_level(label, state)
         self.get_logger().info(f'{text}; {self._rates.line()}')
 
-    def _judgement(self, label: str, state: SessionState | None) -> tuple[bytes, str]:
+    def _status_level(self, label: str, state: SessionState | None) -> tuple[bytes, str]:
         """Level and message of the diagnostics."""
         if self._failure:
             return DiagnosticStatus.ERROR, self._failure
@@ -526,7 +528,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             return DiagnosticStatus.OK, label
         if state.time_jump != self._jump[0]:
             self._jump = state.time_jump, time.monotonic()
-        if state.time_jump and time.monotonic() - self._jump[1] < ALARM:
+        if state.time_jump and time.monotonic() - self._jump[1] < TIME_JUMP_ALARM_TIME:
             return DiagnosticStatus.ERROR, state.time_jump
         trouble = (
             state.trouble()
@@ -548,7 +550,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         label = self._state_machine.current_state[1]
         state = self._session.state if self._session is not None else None
         name = f'{self.get_fully_qualified_name().strip("/")}: {self.SUBJECT}'
-        level, text = self._judgement(label, state)
+        level, text = self._status_level(label, state)
         status = DiagnosticStatus(name=name, level=level, message=text)
         status.hardware_id = self._hardware(state)
         values = [('lifecycle', label)]
@@ -568,7 +570,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
                 *self._events.values(),
                 *self._rates.values(),
                 *(
-                    (f'{SUBSCRIBERS}{topic}', str(self._subscribers(topic)))
+                    (f'{SUBSCRIBERS_KEY}{topic}', str(self._subscribers(topic)))
                     for topic in self._outputs
                 ),
             ]

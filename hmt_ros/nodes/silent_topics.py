@@ -18,9 +18,9 @@ from hmt_ros.sessions.handled import HANDLED
 from hmt_ros.sessions.session import NeededInput, kind_of
 
 # Time without a message after which a topic is silent, and interval of repeated warnings, s.
-SILENCE, REPEAT = 3.0, 30.0
+SILENCE_TIME, WARNING_INTERVAL = 3.0, 30.0
 # Maximum number of topics that are suggested instead.
-_MOST_NAMED = 3
+_MAX_SUGGESTIONS = 3
 _IMAGE, _COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 # Value of `image_transport`, and topic of the subscription, by type of the images.
 _TRANSPORTS = {_IMAGE: ('raw', 'image'), _COMPRESSED: ('compressed', 'image/compressed')}
@@ -44,7 +44,7 @@ class SilentTopics:
     """Watches the topics that a node subscribes to.
 
     Attributes:
-        texts: explanation for each silent topic, as found by the last `look`.
+        texts: explanation for each silent topic, as found by the last `check`.
     """
 
     def __init__(self, node: Node, warn: Callable[[str], None]) -> None:
@@ -56,7 +56,7 @@ class SilentTopics:
         """Time since the last message that triggered an estimate, s; 0 while they arrive."""
         last = self._arrivals.get(self._pace)
         since = 0.0 if last is None else time.monotonic() - last
-        return since if since > SILENCE else 0.0
+        return since if since > SILENCE_TIME else 0.0
 
     def listen(self, inputs: Iterable[SubscribedTopic], pace: str = '') -> None:
         """Restarts with other subscriptions; without subscriptions, nothing is silent.
@@ -75,7 +75,7 @@ class SilentTopics:
         """Records the arrival of a message."""
         self._arrivals[source] = self._arrivals[kind_of(source)] = now
 
-    def look(self, needed: Iterable[NeededInput]) -> None:
+    def check(self, needed: Iterable[NeededInput]) -> None:
         """Finds silent topics among the needed ones, and warns about them."""
         now = time.monotonic()
         newest = self._arrivals.get(self._pace, self._began)
@@ -89,14 +89,14 @@ class SilentTopics:
         self.texts = texts
         for topics, text in texts.items():
             before, at = self._warned.get(topics, ('', 0.0))
-            if text != before or now - at >= REPEAT:
+            if text != before or now - at >= WARNING_INTERVAL:
                 self._warned[topics] = text, now
                 self._warn(text)
         self._warned = {topics: self._warned[topics] for topics in texts}
 
     def _is_silent(self, needed: NeededInput, now: float) -> bool:
         last = max(self._arrivals.get(source, self._began) for source in needed.sources)
-        return now - last >= SILENCE
+        return now - last >= SILENCE_TIME
 
     def _like(self, wanted: list[SubscribedTopic], names: list[str]) -> list[Publication]:
         """Publications of other nodes on topics `names`, or of a type that `wanted` could have.
@@ -149,7 +149,7 @@ def _instead(wanted: SubscribedTopic, name: str, published: list[Publication]) -
     for kind in sorted(kinds, key=lambda each: each != wanted.msgtype):
         transport, topic = kinds[kind]
         there = sorted({x.topic for x in published if x.msgtype == kind})
-        nearest = difflib.get_close_matches(name, there, _MOST_NAMED, 0.0)
+        nearest = difflib.get_close_matches(name, there, _MAX_SUGGESTIONS, 0.0)
         if nearest:
             verb = 'is' if len(nearest) == 1 else 'are'
             named = ', '.join(f'{each} ({_short(kind)})' for each in nearest)

@@ -12,18 +12,18 @@ from ament_index_python.packages import PackageNotFoundError, get_package_share_
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
-from hmt_ros.sessions.image_inputs import DETECTIONS, LARGEST, ImageInput
+from hmt_ros.sessions.image_inputs import DETECTIONS, MAX_MESSAGE_BYTES, ImageInput
 from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.sessions.transform_buffer import TF, TF_STATIC, TRANSFORMS_TYPE
 from msg_tools.messages.images import MAX_PIXELS
 from msg_tools.messages.message_types import register_definitions
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
-RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+RELIABLE_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 # For `~/handled`: a client that waits for each report must not miss the reports on a burst. One
 # turn of the estimating thread reports up to 100 dropped messages, and all waiting messages.
-ANSWERS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-LATCHED = QoSProfile(
+HANDLED_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED_QOS = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
@@ -31,7 +31,7 @@ LATCHED = QoSProfile(
 
 
 # Maximum size of an accepted image, bytes.
-LARGEST_IMAGE = 8 * MAX_PIXELS + 2**16
+MAX_IMAGE_BYTES = 8 * MAX_PIXELS + 2**16
 # Maximum numbers of messages that wait during an estimate: small messages, messages as large as
 # images, and transforms of a whole robot.
 SMALL_QUEUE, LARGE_QUEUE, TF_QUEUE = 100, 20, 2000
@@ -53,7 +53,7 @@ class SubscribedTopic(NamedTuple):
     topic: str
     msgtype: str
     qos: QoSProfile = qos_profile_sensor_data
-    largest: int = LARGEST
+    largest: int = MAX_MESSAGE_BYTES
     waiting: int = SMALL_QUEUE
 
 
@@ -69,7 +69,7 @@ TRANSFORM_TOPICS = (
     SubscribedTopic(TF, '/tf', TRANSFORMS_TYPE, _TF_QOS, waiting=TF_QUEUE),
 )
 # Deep enough for the mixtures that arrive while `~/smooth_window` runs for some seconds.
-_MIXTURES = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
+_MIXTURE_QOS = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
 CAMERA_INFO_TOPIC = SubscribedTopic(CAMERA_INFO, 'camera_info', 'sensor_msgs/msg/CameraInfo')
 
 
@@ -78,7 +78,7 @@ def image_topic(image_transport: str) -> SubscribedTopic:
     topic, kind = ('image', 'Image')
     if image_transport == 'compressed':
         topic, kind = ('image/compressed', 'CompressedImage')
-    return SubscribedTopic(IMAGE, topic, f'sensor_msgs/msg/{kind}', largest=LARGEST_IMAGE)
+    return SubscribedTopic(IMAGE, topic, f'sensor_msgs/msg/{kind}', largest=MAX_IMAGE_BYTES)
 
 
 def input_topics(rows: Iterable[ImageInput]) -> Iterator[SubscribedTopic]:
@@ -89,7 +89,7 @@ def input_topics(rows: Iterable[ImageInput]) -> Iterator[SubscribedTopic]:
                 source,
                 source,
                 msgtype,
-                RELIABLE if row.reliable else qos_profile_sensor_data,
+                RELIABLE_QOS if row.reliable else qos_profile_sensor_data,
                 row.largest,
                 LARGE_QUEUE if row.pixels is not None else SMALL_QUEUE,
             )
@@ -102,12 +102,12 @@ def types_of_others(rows: Iterable[ImageInput], source: str) -> dict[str, str]:
 
 def published_with(published: PublishedTopic) -> tuple[str, QoSProfile]:
     """Type and quality of service of a topic that a session publishes."""
-    return published.msgtype, LATCHED if published.latched else RELIABLE
+    return published.msgtype, LATCHED_QOS if published.latched else RELIABLE_QOS
 
 
 def mixture_topic(source: str, topic: str) -> SubscribedTopic:
     """Pose mixtures of a person, with a queue for a subscriber that is slow for some seconds."""
-    return SubscribedTopic(source, topic, POSE_MIXTURE, _MIXTURES)
+    return SubscribedTopic(source, topic, POSE_MIXTURE, _MIXTURE_QOS)
 
 
 def message_class(msgtype: str) -> Any:

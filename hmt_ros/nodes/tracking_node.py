@@ -29,7 +29,7 @@ from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
 
 # Period of the watchdog, s.
-_GLANCE = 0.05
+_WATCHDOG_PERIOD = 0.05
 
 
 class TrackingNode(SessionNode[Any, Any]):
@@ -97,7 +97,7 @@ class TrackingNode(SessionNode[Any, Any]):
     def _watch(self, session: TrackingSession, inactive: threading.Event) -> None:
         """Publishes warnings for robots while there are no outputs for new images."""
         count, answered = session.answered, time.monotonic()
-        while not inactive.wait(_GLANCE):
+        while not inactive.wait(_WATCHDOG_PERIOD):
             now = time.monotonic()
             if session.answered != count:
                 count, answered = session.answered, now

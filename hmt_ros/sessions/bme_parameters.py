@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from hmt_ros.experts.lifter import SHIPPED as LIFTER
-from hmt_ros.experts.pose_predictor import ALONE, PROPAGATIONS
+from hmt_ros.experts.pose_predictor import PROPAGATIONS, WITHOUT_PROPAGATION
 from hmt_ros.sessions.camera_frames import unit_vector
 from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
@@ -51,7 +51,7 @@ class BmeParameters(CameraNodeParameters):
     gravity: tuple[float, ...] = parameter_field((), NEXT_CONFIGURE)
     predict_from: str = parameter_field(FROM_SILHOUETTES, NEXT_CONFIGURE)
     lifter: str = parameter_field(LIFTER, NEXT_CONFIGURE)
-    propagation: str = parameter_field(ALONE, NEXT_CONFIGURE)
+    propagation: str = parameter_field(WITHOUT_PROPAGATION, NEXT_CONFIGURE)
     max_hypotheses: int = parameter_field(5, AT_ONCE, (1, 64))
     tracked_interval: float = parameter_field(0.0, NEXT_CONFIGURE, (0.0, 3600.0))
 

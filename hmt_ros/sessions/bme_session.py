@@ -15,7 +15,7 @@ The rules, in addition to those of `CameraSession`:
   not, if somebody subscribes. It is empty while the background is being learned. With `use_mask`
   no silhouette is published.
 - With `propagation` a prediction depends on the previous one, unless the latter is older than
-  `LONGEST_INTERVAL`, belongs to another calibration, or precedes a jump in time.
+  `MAX_INTERVAL`, belongs to another calibration, or precedes a jump in time.
 - With `predict_from` 'keypoints' every message of keypoints gets one prediction, from the keypoints
   of the last second (`experts.lifter`); images are not used. It has no components if fewer than
   five landmarks are seen. With 'both' an image waits for the keypoints of exactly its stamp, for
@@ -39,10 +39,10 @@ from hmt_ros.body.camera import roll
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError
 from hmt_ros.experts.lifted_fit import KeypointPredictor
 from hmt_ros.experts.pose_predictor import (
-    ALONE,
     BY_EXPERTS,
     SHIPPED,
     STEP,
+    WITHOUT_PROPAGATION,
     PosePredictor,
     Prediction,
     load_predictor,
@@ -92,11 +92,11 @@ _TOPICS_OF_NODE = {**TOPICS, SILHOUETTE: PublishedTopic('sensor_msgs/msg/Image')
 
 
 # Minimum height of the silhouette of a person, px.
-LEAST_HEIGHT = 40
+MIN_HEIGHT = 40
 # Maximum age of the previous prediction for propagation, s.
-LONGEST_INTERVAL = 0.5
+MAX_INTERVAL = 0.5
 # Maximum time between an image and a message of the track that applies to the image, ns.
-_SURE_NS = SECOND_NS
+_TRACKED_TIME_NS = SECOND_NS
 # Relative standard deviation of the size of a person whose stature is known.
 _MEASURED_SPREAD = 0.02
 
@@ -213,7 +213,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             self._take_keypoints(row, message, stamp)
         elif source != TRACK:
             super()._take(source, message, stamp)
-        elif self._tracked is None or not 0 <= self._tracked - stamp <= _SURE_NS:
+        elif self._tracked is None or not 0 <= self._tracked - stamp <= _TRACKED_TIME_NS:
             tracked = message.state == TrackState.TRACKING and len(message.components)
             self._tracked = stamp if tracked else None
 
@@ -234,7 +234,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             text = f'no prediction from the keypoints of {stamp} ns: {error_line(error)}'
             self._log.skip('keypoints', text)
             return
-        self._tell(mixture, stamp, self._frame_id or self._frame or FRAME_ID)
+        self._report_handled(mixture, stamp, self._frame_id or self._frame or FRAME_ID)
 
     def _lifted(self, stamp: int, camera: Camera) -> GaussianMixture | None:
         """Return the prediction from keypoints; None if they show nobody at the stamp."""
@@ -264,30 +264,30 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if self._cue == FROM_KEYPOINTS:
             return
         in_turn = not self._waiting and self._newest is not None and stamp > self._newest
-        if not in_turn or not self._is_left_to_track(stamp) or self._wanted(SILHOUETTE):
+        if not in_turn or not self._is_tracked(stamp) or self._wanted(SILHOUETTE):
             super()._take_image(message, stamp)
             return
         # The image is left to the track without being decoded.
         self._newest = stamp
-        self._leave_to_track(stamp, str(message.header.frame_id) or self._frame or FRAME_ID)
+        self._skip_prediction(stamp, str(message.header.frame_id) or self._frame or FRAME_ID)
 
-    def _is_left_to_track(self, stamp: int) -> bool:
+    def _is_tracked(self, stamp: int) -> bool:
         """Whether an image needs no prediction because the person is tracked."""
         interval = self.parameters.tracked_interval * SECOND_NS
         if self._looked is None or self._tracked is None:
             return False
-        return stamp < self._looked + interval and abs(stamp - self._tracked) <= _SURE_NS
+        return stamp < self._looked + interval and abs(stamp - self._tracked) <= _TRACKED_TIME_NS
 
-    def _leave_to_track(self, stamp: int, frame_id: str) -> None:
+    def _skip_prediction(self, stamp: int, frame_id: str) -> None:
         self._log.counts['left'] += 1
         if self._wanted(PREDICTION):
             made = self._message(None, stamp, frame_id, TrackState.TRACKING)
             self._publish(PREDICTION, stamp, made)
 
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
-        if self._is_left_to_track(waiting.stamp_ns):
+        if self._is_tracked(waiting.stamp_ns):
             self._publish_silhouette(waiting)
-            self._leave_to_track(waiting.stamp_ns, waiting.frame_id)
+            self._skip_prediction(waiting.stamp_ns, waiting.frame_id)
             return
         self._looked, self._reason = waiting.stamp_ns, ''
         try:
@@ -299,9 +299,9 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             return
         if mixture is not None:
             self._previous = mixture, waiting.stamp_ns
-        self._tell(mixture, waiting.stamp_ns, waiting.frame_id)
+        self._report_handled(mixture, waiting.stamp_ns, waiting.frame_id)
 
-    def _tell(self, mixture: GaussianMixture | None, stamp: int, frame_id: str) -> None:
+    def _report_handled(self, mixture: GaussianMixture | None, stamp: int, frame_id: str) -> None:
         """Counts and publishes a prediction; None means that nobody is seen."""
         self._log.counts['predicted'] += 1
         if mixture is None:
@@ -321,7 +321,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
                 return lifted
         self._without_background = given is not None
         if given is None:
-            mask = self._judged_silhouette(waiting)
+            mask = self._usable_silhouette(waiting)
             self._publish_silhouette(waiting, mask)
             if not self._scene.known:
                 self._reason = self._scene.wants
@@ -331,7 +331,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             with self._background_in_use:
                 self._scene.learn(waiting.image, waiting.stamp_ns, bool(given.any()))
         self._height = _height(mask)
-        if self._height < LEAST_HEIGHT:
+        if self._height < MIN_HEIGHT:
             return None
         try:
             before = self._known_before(waiting.stamp_ns)
@@ -343,13 +343,13 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             self._log.note('silhouette', f'image of {waiting.stamp_ns} ns: {text}')
         return found.mixture
 
-    def _judged_silhouette(self, waiting: WaitingImage) -> Mask:
+    def _usable_silhouette(self, waiting: WaitingImage) -> Mask:
         """Return the silhouette of an image; it is empty until the scene has been seen empty."""
         scene, stamp = self._scene, waiting.stamp_ns
         with self._background_in_use:
             if scene.seen:
                 self._look_at_scene(waiting, scene.background, 'configure the node again')
-                scene.judge(waiting.image, stamp)
+                scene.update(waiting.image, stamp)
                 if scene.known:
                     return scene.background.silhouette(waiting.image)
             if scene.is_of_somebody:
@@ -360,10 +360,10 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
     def _known_before(self, stamp_ns: int) -> tuple[GaussianMixture | None, float]:
         """Return the previous prediction, if it is recent, and the time since then, s."""
         previous = self._previous
-        if self.parameters.propagation == ALONE or previous is None:
+        if self.parameters.propagation == WITHOUT_PROPAGATION or previous is None:
             return None, STEP
         interval = (stamp_ns - previous[1]) / SECOND_NS
-        return (None, STEP) if interval > LONGEST_INTERVAL else (previous[0], interval)
+        return (None, STEP) if interval > MAX_INTERVAL else (previous[0], interval)
 
     def _seen(
         self,
@@ -439,10 +439,10 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         image = self.decode_image(message)
         check_size(image, camera)
         mask = self._silhouette(image)
-        if _height(mask) < LEAST_HEIGHT:
+        if _height(mask) < MIN_HEIGHT:
             raise ValueError(
                 f'nobody is seen: the silhouette is {_height(mask)} px high, wanted at least '
-                f'{LEAST_HEIGHT}'
+                f'{MIN_HEIGHT}'
             )
         mixture = self._seen(mask, image, camera).mixture
         return self._message(mixture, time_ns(message.header.stamp), str(message.header.frame_id))

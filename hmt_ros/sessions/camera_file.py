@@ -29,9 +29,9 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-LARGEST_FILE = 1_000_000  # bytes
+MAX_FILE_BYTES = 1_000_000  # bytes
 # Names of the same entry in the files of different programs.
-_MATRIX = (
+_MATRIX_KEYS = (
     'camera_matrix',
     'Camera_Matrix',
     'cameraMatrix',
@@ -41,7 +41,7 @@ _MATRIX = (
     'matrix',
     'intrinsics',
 )
-_DISTORTION = (
+_DISTORTION_KEYS = (
     'distortion_coefficients',
     'Distortion_Coefficients',
     'distCoeffs',
@@ -61,10 +61,10 @@ _FISHEYE = ('fisheye', 'fisheye_model')
 _TAG_OF_OPENCV = re.compile(r'(?<=[:-] )!{1,2}<?opencv-[\w-]+>?')
 # A list that is too long for the matrix or the distortion of a camera.
 _LONG_LIST = re.compile(r'\[[^][]{2000,}\]')
-_MOST_NUMBERS = 100  # maximum number of values of a matrix or a distortion
-_MOST_POINTS = 200  # maximum number of dots in a line: parsing of dotted TOML keys is quadratic
+_MAX_MATRIX_VALUES = 100  # maximum number of values of a matrix or a distortion
+_MAX_DOTS = 200  # maximum number of dots in a line: parsing of dotted TOML keys is quadratic
 
-Tell = Callable[[str], object]
+Notify = Callable[[str], object]
 
 
 def camera_of_view(
@@ -89,14 +89,14 @@ def camera_of_view(
     return Camera(fx, fy, (width - 1) / 2, (height - 1) / 2, width, height)
 
 
-def read_camera(path: Path, size: tuple[int, int], tell: Tell = lambda text: None) -> Camera:
+def read_camera(path: Path, size: tuple[int, int], notify: Notify = lambda text: None) -> Camera:
     """Read the camera of a calibration file.
 
     Args:
         path: the file; FILE:NAME selects the camera NAME if the file has several cameras.
         size: width and height of the images, px; a calibration for another size of the same aspect
             ratio is scaled, and a calibration without a size is assumed to be for this size.
-        tell: function that is called with a line on each neglected or scaled entry.
+        notify: function that is called with a line on each neglected or scaled entry.
 
     Raises:
         ValueError: the file has no calibration, or one that is damaged or for another aspect ratio.
@@ -106,10 +106,12 @@ def read_camera(path: Path, size: tuple[int, int], tell: Tell = lambda text: Non
         head, _, name = str(path).rpartition(':')
         file = Path(head)
     try:
-        found, model = _content(file, read_bytes(file, LARGEST_FILE).decode('utf-8'))
+        found, model = _content(file, read_bytes(file, MAX_FILE_BYTES).decode('utf-8'))
         calibrations = _calibrations(found)
         if not calibrations:
-            raise ValueError(f'no calibration: none of the names {", ".join(_MATRIX)} is in it')
+            raise ValueError(
+                f'no calibration: none of the names {", ".join(_MATRIX_KEYS)} is in it'
+            )
         named = {str(x.get('name')): x for x in calibrations.values()} | calibrations
         if name not in named and (name or len(calibrations) > 1):
             some = next(iter(calibrations))
@@ -117,7 +119,7 @@ def read_camera(path: Path, size: tuple[int, int], tell: Tell = lambda text: Non
                 f'calibrations of the cameras {", ".join(calibrations)}: name one, as {file}:{some}'
             )
         entries = _entries(named.get(name, next(iter(calibrations.values()))), model, size)
-        return camera_from_info(SimpleNamespace(**entries), size, lambda x: tell(f'{path}: {x}'))
+        return camera_from_info(SimpleNamespace(**entries), size, lambda x: notify(f'{path}: {x}'))
     except (ValueError, TypeError, ArithmeticError, RecursionError) as error:
         raise ValueError(f'{path}: {error_line(error)}') from error
 
@@ -125,8 +127,8 @@ def read_camera(path: Path, size: tuple[int, int], tell: Tell = lambda text: Non
 def _content(path: Path, text: str) -> tuple[Any, str]:
     """Return the entries of a file, and the default model of the distortion."""
     if path.suffix.lower() == '.toml':
-        if any(line.count('.') > _MOST_POINTS for line in text.splitlines()):
-            raise ValueError(f'a line with more than {_MOST_POINTS} points')
+        if any(line.count('.') > _MAX_DOTS for line in text.splitlines()):
+            raise ValueError(f'a line with more than {_MAX_DOTS} points')
         return tomllib.loads(text), 'pinhole'
     start = text.lstrip()
     if start.startswith('<?xml'):
@@ -169,7 +171,7 @@ def _calibrations(content: Any, name: str = '') -> dict[str, dict[Any, Any]]:
     """Return the tables that have a camera matrix, by name."""
     if not isinstance(content, dict):
         return {}
-    if _first(content, _MATRIX) is not None:
+    if _first(content, _MATRIX_KEYS) is not None:
         return {name: content}
     return {k: v for x in content for k, v in _calibrations(content[x], str(x)).items()}
 
@@ -180,7 +182,10 @@ def _entries(content: dict[Any, Any], model: str, size: tuple[int, int]) -> dict
     Args:
         model: default model of the distortion.
     """
-    k, d = _numbers(_first(content, _MATRIX)), _numbers(_first(content, _DISTORTION) or [])
+    k, d = (
+        _numbers(_first(content, _MATRIX_KEYS)),
+        _numbers(_first(content, _DISTORTION_KEYS) or []),
+    )
     if 4 <= len(k) <= 6:  # kalibr: parameters of models other than the pinhole precede these four
         fx, fy, cx, cy = k[-4:]
         k = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
@@ -225,7 +230,7 @@ def _numbers(value: Any) -> list[float]:
     values = [x for row in rows for x in (row if isinstance(row, list) else [row])]
     try:
         # YAML reads 1e-05, without a point, as a string.
-        if len(values) <= _MOST_NUMBERS and not any(isinstance(x, bool) for x in values):
+        if len(values) <= _MAX_MATRIX_VALUES and not any(isinstance(x, bool) for x in values):
             return [float(x) for x in values]
         seen = f'{len(values)} values'
     except (TypeError, ValueError, OverflowError) as error:

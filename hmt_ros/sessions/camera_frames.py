@@ -20,7 +20,7 @@ from hmt_ros.tracking.ground import KnownGround
 from hmt_ros.tracking.settings import MAX_EXTRAPOLATION_TIME
 
 # Minimum length of a vector that has a direction.
-_SHORTEST = 1e-6
+_MIN_VECTOR_LENGTH = 1e-6
 
 
 # Standard deviation of a direction from transforms (inertial sensor and its mounting), rad.
@@ -80,14 +80,14 @@ class CameraFrames:
             return False
         return True
 
-    def look(self, camera_frame: str, stamp_ns: int) -> list[tuple[str, str]]:
+    def update(self, camera_frame: str, stamp_ns: int) -> list[tuple[str, str]]:
         """Looks up gravity and the pose of the camera at the time of an image.
 
         Returns:
             Kind and text of each fault.
         """
-        gravity = self._look_for_gravity(camera_frame, stamp_ns) if self.gravity_frame else []
-        pose = self._look_for_pose(camera_frame, stamp_ns) if self.fixed_frame else []
+        gravity = self._find_gravity(camera_frame, stamp_ns) if self.gravity_frame else []
+        pose = self._find_pose(camera_frame, stamp_ns) if self.fixed_frame else []
         return gravity + pose
 
     def known_ground(self, otherwise: KnownGround) -> KnownGround:
@@ -98,7 +98,7 @@ class CameraFrames:
         known = height if self._floor and height > 0 else otherwise.camera_height
         return KnownGround(up, known, UP_SIGMA)
 
-    def _look_for_gravity(self, camera_frame: str, stamp_ns: int) -> list[tuple[str, str]]:
+    def _find_gravity(self, camera_frame: str, stamp_ns: int) -> list[tuple[str, str]]:
         name, self.newest = self.gravity_frame, False
         try:
             found = self._transforms.lookup(camera_frame, name, stamp_ns)
@@ -119,7 +119,7 @@ class CameraFrames:
         )
         return [('height of the camera', text)]
 
-    def _look_for_pose(self, camera_frame: str, stamp_ns: int) -> list[tuple[str, str]]:
+    def _find_pose(self, camera_frame: str, stamp_ns: int) -> list[tuple[str, str]]:
         name = self.fixed_frame
         try:
             self.pose = self._transforms.lookup(name, camera_frame, stamp_ns)
@@ -142,6 +142,6 @@ def unit_vector(vector: Sequence[float], name: str) -> Array:
     """
     v = np.asarray(vector, dtype=np.float64)
     size = length(v) if v.shape == (3,) else math.nan
-    if not _SHORTEST < size < math.inf:
+    if not _MIN_VECTOR_LENGTH < size < math.inf:
         raise ValueError(f'{name} must be three finite numbers, not all zero, saw {v.tolist()}')
     return v / size

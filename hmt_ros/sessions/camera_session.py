@@ -1,9 +1,9 @@
 """Sessions that estimate from the images of one camera.
 
 Images are used in the order of their stamps. They wait for the first calibrated camera_info and for
-other inputs (`image_inputs`); if more than `MOST_INCOMPLETE` images wait, the oldest are dropped. A
-session is late if messages have arrived during an estimate while images waited for it. Then, of the
-images whose other inputs are complete, only the newest `queue_size` are used.
+other inputs (`image_inputs`); if more than `MAX_INCOMPLETE_IMAGES` images wait, the oldest are
+dropped. A session is late if messages have arrived during an estimate while images waited for it.
+Then, of the images whose other inputs are complete, only the newest `queue_size` are used.
 
 If the parameters name a frame, an image also waits for the transforms of its stamp. This wait ends
 with an image or a transform that is `input_timeout` younger, and before the image would be dropped.
@@ -36,7 +36,7 @@ from hmt_ros.sessions.image_inputs import (
     DETECTIONS,
     MASK,
     MASK_INPUT,
-    REMEMBERED,
+    MAX_SMALL_INPUTS,
     ImageInput,
     ImageInputs,
 )
@@ -51,21 +51,21 @@ from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.images import ImageError, decode_picture
 
 CAMERA_INFO, IMAGE = 'camera_info', 'image'
-CAMERA_MOVED = 'the camera has moved since the background was taken'
-IN_BACKGROUND = 'the background was learned with the person in it'
+CAMERA_MOVED_FAULT = 'the camera has moved since the background was taken'
+PERSON_IN_BACKGROUND_FAULT = 'the background was learned with the person in it'
 FRAME_ID = 'camera_optical_frame'  # default if neither image nor camera_info names a frame
 
 CameraParameters = TypeVar('CameraParameters', bound=CameraNodeParameters)
 
 # Maximum number of images that wait for other inputs: half a second at a common image rate.
-MOST_INCOMPLETE = 16
+MAX_INCOMPLETE_IMAGES = 16
 # Maximum size of the images that wait, bytes.
-MOST_BYTES = 2**29
-_LARGEST_PICTURE_FILE = 2**28  # bytes
+MAX_INCOMPLETE_BYTES = 2**29
+_MAX_PICTURE_BYTES = 2**28  # bytes
 # Minimum length of the time window after an image in which a later input ends its wait, s.
-_LATER = 1.0
+_MIN_LEAD_TIME = 1.0
 # Maximum number of remembered frame names per source; a camera has one.
-_MOST_FRAMES = 8
+_MAX_FRAMES = 8
 
 
 class WaitingImage(NamedTuple):
@@ -110,7 +110,7 @@ class CameraState(SessionState):
 
     def trouble(self) -> str:
         """Return why the background is unusable; '' if it is usable."""
-        return CAMERA_MOVED if self.moved else ''
+        return CAMERA_MOVED_FAULT if self.moved else ''
 
 
 class CameraSession(Session[CameraParameters, State]):
@@ -142,7 +142,7 @@ class CameraSession(Session[CameraParameters, State]):
         # stamps of dropped images.
         self._fresh = 0
         self._left = False
-        self._dropped: deque[int] = deque(maxlen=REMEMBERED)
+        self._dropped: deque[int] = deque(maxlen=MAX_SMALL_INPUTS)
 
     def needed_inputs(self) -> list[NeededInput]:
         """Inputs that are needed at present. Thread-safe."""
@@ -175,7 +175,7 @@ class CameraSession(Session[CameraParameters, State]):
     def most_waiting(self) -> int:
         """See `Session`."""
         size = self.parameters.queue_size
-        return max(size, MOST_INCOMPLETE) if self._awaited() or self.frames.wanted else size
+        return max(size, MAX_INCOMPLETE_IMAGES) if self._awaited() or self.frames.wanted else size
 
     def _drop(self, stamp_ns: int) -> None:
         self._dropped.append(stamp_ns)
@@ -187,7 +187,7 @@ class CameraSession(Session[CameraParameters, State]):
 
     def _missing(self, stamp: int) -> ImageInput | None:
         """Return the first input that an image waits for; None if it waits for none."""
-        within = max(self.parameters.input_timeout, _LATER) * SECOND_NS
+        within = max(self.parameters.input_timeout, _MIN_LEAD_TIME) * SECOND_NS
         for row in self._awaited():
             if not self._inputs[row.name].is_settled(stamp, within) and not self._is_overdue(stamp):
                 return row
@@ -249,10 +249,10 @@ class CameraSession(Session[CameraParameters, State]):
 
     def _take_camera_info(self, message: Any) -> None:
         self._info_stamp = time_ns(message.header.stamp)
-        self._see_frame(CAMERA_INFO, message)
+        self._check_frame_id(CAMERA_INFO, message)
         neglected: list[str] = []
         try:
-            camera = camera_from_info(message, tell=neglected.append)
+            camera = camera_from_info(message, notify=neglected.append)
         except CameraInfoError as error:
             text = camera_info_fault(error, self._on_topic(CAMERA_INFO))
             self._uncalibrated = text if self._camera is None else ''
@@ -269,13 +269,13 @@ class CameraSession(Session[CameraParameters, State]):
             self._log.note('calibration', text)
             self.restart()
 
-    def _see_frame(self, source: str, message: Any) -> None:
+    def _check_frame_id(self, source: str, message: Any) -> None:
         """Warns once for each additional frame that the messages of a source name.
 
         This reveals two publishers on one topic, or the camera_info of another camera.
         """
         frame, seen = str(message.header.frame_id), self._named_frames[source]
-        if not frame or frame in seen or len(seen) == _MOST_FRAMES:
+        if not frame or frame in seen or len(seen) == _MAX_FRAMES:
             return
         seen.append(frame)
         images, infos = self._named_frames[IMAGE], self._named_frames[CAMERA_INFO]
@@ -297,7 +297,7 @@ class CameraSession(Session[CameraParameters, State]):
             )
 
     def _take_image(self, message: Any, stamp: int) -> None:
-        self._see_frame(IMAGE, message)
+        self._check_frame_id(IMAGE, message)
         try:
             image = self.decode_image(message)
         except ImageError as error:
@@ -317,12 +317,12 @@ class CameraSession(Session[CameraParameters, State]):
     ) -> None:
         """Warns once when the camera has moved; see `camera_moved_fault` for the remedy."""
         before = self._watch.moved
-        self._watch.look(waiting.image, background)
+        self._watch.update(waiting.image, background)
         if self._watch.moved and not before:
             text = camera_moved_fault(self._watch.shift, waiting.stamp_ns, remedy)
             self._log.note('camera moved', text, warn=True)
 
-    def _use_what_has_come(self) -> None:
+    def _estimate_from_inputs(self) -> None:
         late, self._fresh, self._left = self._left or self._fresh > 1, 0, False
         if self._camera is not None:
             if late:
@@ -340,9 +340,9 @@ class CameraSession(Session[CameraParameters, State]):
             self._drop(self._waiting.popleft().stamp_ns)
 
     def _drop_incomplete_images(self) -> None:
-        most = max(self.parameters.queue_size, MOST_INCOMPLETE)
+        most = max(self.parameters.queue_size, MAX_INCOMPLETE_IMAGES)
         size = sum(one.image.nbytes for one in self._waiting)
-        while len(self._waiting) > most or (size > MOST_BYTES and len(self._waiting) > 1):
+        while len(self._waiting) > most or (size > MAX_INCOMPLETE_BYTES and len(self._waiting) > 1):
             size -= self._waiting[0].image.nbytes
             stamp = self._waiting.popleft().stamp_ns
             self._dropped.append(stamp)
@@ -406,8 +406,8 @@ def camera_moved_fault(shift: float, stamp_ns: int, remedy: str) -> str:
     """
     far = 'elsewhere' if math.isnan(shift) else f'{shift:.0f} px away'
     return (
-        f'{CAMERA_MOVED}: at the image of {stamp_ns} ns the scene is {far}; fix the camera, take '
-        f'background_file again, or let the background be learned, and {remedy}'
+        f'{CAMERA_MOVED_FAULT}: at the image of {stamp_ns} ns the scene is {far}; fix the camera, '
+        f'take background_file again, or let the background be learned, and {remedy}'
     )
 
 
@@ -429,7 +429,7 @@ def read_picture(file: str) -> Image:
     """
     with named_file('background_file', file, 'PNG or JPEG image'):
         try:
-            return decode_picture(read_bytes(file, _LARGEST_PICTURE_FILE))
+            return decode_picture(read_bytes(file, _MAX_PICTURE_BYTES))
         except ImageError as error:
             raise ValueError(f'{file}: not a picture ({error})') from error
         except ValueError as error:

@@ -42,10 +42,10 @@ EFFECTS = {
 FRACTION = (0.0, 1.0)
 
 TRANSPORTS = ('raw', 'compressed')
-LONGEST_TIMEOUT = 60.0  # s
-LONGEST_VALUE = 4096  # characters of a text, or entries of a list
+MAX_TIMEOUT = 60.0  # s
+MAX_VALUE_LENGTH = 4096  # characters of a text, or entries of a list
 # Value of `source` for messages of this package.
-OWN_KEYPOINTS = 'keypoints'
+OWN_SOURCE = 'keypoints'
 
 # Scheme of keypoints that come without names, unless another is named.
 USUAL_ORDER = 'coco17'
@@ -144,13 +144,13 @@ class CameraNodeParameters(ImageNodeParameters):
     """
 
     use_mask: bool = parameter_field(False, AT_ONCE)
-    source: str = parameter_field(OWN_KEYPOINTS, NEXT_CONFIGURE)
+    source: str = parameter_field(OWN_SOURCE, NEXT_CONFIGURE)
     person_id: str = parameter_field('', AT_ONCE)
     keypoint_scheme: str = parameter_field(AUTO, AT_ONCE)
-    input_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, LONGEST_TIMEOUT))
+    input_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, MAX_TIMEOUT))
 
     # Values of `source`.
-    SOURCES: ClassVar[tuple[str, ...]] = (OWN_KEYPOINTS, 'skeleton2d', 'yolo', 'floats')
+    SOURCES: ClassVar[tuple[str, ...]] = (OWN_SOURCE, 'skeleton2d', 'yolo', 'floats')
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -197,9 +197,9 @@ class DeclaredParameter:
             ValueError: another type, or beyond the limits.
         """
         wanted: Any = type(self.default)
-        if hasattr(value, '__len__') and len(value) > LONGEST_VALUE:
+        if hasattr(value, '__len__') and len(value) > MAX_VALUE_LENGTH:
             raise ValueError(
-                f'{self.name} has the length {len(value)}, the limit is {LONGEST_VALUE}'
+                f'{self.name} has the length {len(value)}, the limit is {MAX_VALUE_LENGTH}'
             )
         if wanted is tuple:
             return self._numbers(value)

@@ -21,9 +21,9 @@ from hmt_ros.sessions.transform_buffer import Transform
 from hmt_ros.tracking.camera_motion import CameraMotion
 
 # Rotation to (x forward, y left, z up) from (x right, y down, z forward).
-FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+OPTICAL_TO_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 # Sine of the angle between view and vertical below which the view has no heading.
-_VERTICAL = 1e-3
+_MIN_HEADING_SINE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class FixedFrame:
     @property
     def motion(self) -> CameraMotion:
         """Transform from the frame of the camera to the frame `optical`."""
-        back = FROM_OPTICAL.T
+        back = OPTICAL_TO_BODY.T
         return CameraMotion(
             product(back, self.camera.rotation), product(back, self.camera.translation)
         )
@@ -90,7 +90,7 @@ def upright(up: Array) -> Array:
     """
     forward = np.array([0.0, 0.0, 1.0])
     forward = forward - product(forward, up) * up
-    if length(forward) < _VERTICAL:
+    if length(forward) < _MIN_HEADING_SINE:
         forward = np.array([0.0, -1.0, 0.0])
         forward = forward - product(forward, up) * up
     forward = forward / length(forward)

@@ -110,7 +110,7 @@ class HandlingLog:
         if warn or self.faults[kind] == 1:
             self._warned.append(self.last_fault)
 
-    def tell(self, text: str) -> None:
+    def add_event(self, text: str) -> None:
         """Logs an event that is no fault."""
         self._events.append(one_line(f'{self.prefix}{text}'))
 

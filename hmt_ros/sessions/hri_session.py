@@ -8,7 +8,7 @@ The rules, in addition to those of `Session`:
   twice.
 - /humans/bodies/tracked lists the bodies that are tracked. A body whose track is lost is not in the
   list until the same track is found again. A body ends with its track, with a mixture without
-  components, or `LONGEST_SILENCE` after its last mixture.
+  components, or `MAX_SILENCE` after its last mixture.
 - A body is shown in one pose, its heaviest mode. Until that mode ends, another mode replaces it
   only with more than twice its weight.
 - Regions, landmarks and cropped images need the calibrated camera_info of the frame of the mixture;
@@ -70,15 +70,15 @@ BODY_TOPICS = {
 }
 MIXTURE = 'pose_mixture'
 # Minimum weight, relative to the heaviest mode, at which the shown mode is kept.
-_KEPT = 0.5
+_MIN_RELATIVE_WEIGHT = 0.5
 # Maximum change of a joint's origin without a new URDF, m.
-_RESHAPED = 0.005
+_MAX_ORIGIN_CHANGE = 0.005
 # Time without a mixture after which a body ends, by the stamps of camera_info, s.
-LONGEST_SILENCE = 2.0
+MAX_SILENCE = 2.0
 # Maximum number of people without a body whose last body number is remembered.
-_REMEMBERED = 1000
+_MAX_REMEMBERED_PEOPLE = 1000
 # Number of images kept for cropping; a filter with a larger delay drops images itself.
-_IMAGES = 20
+_MAX_IMAGES = 20
 
 
 def mixture_source(namespace: str) -> str:
@@ -126,13 +126,13 @@ class _Person:
         """Ends the body."""
         self.identity, self.tracked = '', False
 
-    def goes_on(self, track: int) -> bool:
+    def continues_track(self, track: int) -> bool:
         """Whether the present body belongs to a track, given its number; 0: unnumbered."""
         return bool(self.identity) and track == self.track
 
     def begin(self, track: int) -> None:
         """Continues the body of a track, or begins a new body with a larger number."""
-        if not self.goes_on(track):
+        if not self.continues_track(track):
             # A restarted filter numbers its tracks from 1 again.
             self.bodies = max(track, self.bodies + 1)
             self.identity = f'{self.name}_{self.bodies}'
@@ -209,7 +209,7 @@ class HriSession(Session[HriParameters, HriState]):
             self._take_camera_info(message, stamp)
         elif source == IMAGE:
             self._images[stamp] = message
-            while len(self._images) > _IMAGES:
+            while len(self._images) > _MAX_IMAGES:
                 del self._images[next(iter(self._images))]
         else:
             self._take_mixture(source.removeprefix(mixture_source('')), message, stamp)
@@ -223,7 +223,7 @@ class HriSession(Session[HriParameters, HriState]):
         except CameraInfoError as error:
             text = camera_info_fault(error, self._on_topic(CAMERA_INFO))
             self._log.fault('camera_info', text)
-        longest = LONGEST_SILENCE * SECOND_NS
+        longest = MAX_SILENCE * SECOND_NS
         silent = [p for p in self._people.values() if p.identity and self._now - p.heard > longest]
         for person in silent:
             person.end()
@@ -259,7 +259,7 @@ class HriSession(Session[HriParameters, HriState]):
     def _person_in(self, namespace: str) -> _Person:
         if namespace not in self._people:
             gone = [name for name, person in self._people.items() if not person.identity]
-            for name in gone[: max(len(gone) - _REMEMBERED + 1, 0)]:
+            for name in gone[: max(len(gone) - _MAX_REMEMBERED_PEOPLE + 1, 0)]:
                 del self._people[name]
             self._people[namespace] = _Person(_name_in(namespace))
         return self._people[namespace]
@@ -279,8 +279,8 @@ class HriSession(Session[HriParameters, HriState]):
             ValueError: the joint positions are impossible for a person.
         """
         p, stamp = self.parameters, content.stamp_ns
-        shown = _shown_mode(content, person.mode if person.goes_on(content.track_id) else 0)
-        before = person.angles if person.goes_on(content.track_id) else None
+        shown = _shown_mode(content, person.mode if person.continues_track(content.track_id) else 0)
+        before = person.angles if person.continues_track(content.track_id) else None
         human = fit_reference_human(
             content.joint_names, content.joint_positions[shown], before, additions=p.added_joints
         )
@@ -384,7 +384,7 @@ def _shown_mode(content: PoseMixture, before: int) -> int:
     assert content.identities is not None
     heaviest = int(np.argmax(content.weights))
     for k in np.flatnonzero(content.identities == before) if before else ():
-        if content.weights[k] >= _KEPT * content.weights[heaviest]:
+        if content.weights[k] >= _MIN_RELATIVE_WEIGHT * content.weights[heaviest]:
             return int(k)
     return heaviest
 
@@ -394,4 +394,4 @@ def _alike(joints: tuple[Joint, ...], others: tuple[Joint, ...]) -> bool:
     if [joint.name for joint in joints] != [joint.name for joint in others]:
         return False
     pairs = zip(joints, others, strict=True)
-    return all(float(np.abs(a.origin - b.origin).max()) <= _RESHAPED for a, b in pairs)
+    return all(float(np.abs(a.origin - b.origin).max()) <= _MAX_ORIGIN_CHANGE for a, b in pairs)

@@ -19,7 +19,7 @@ from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture
 
 # Maximum mean speed of the joints relative to the pelvis, m/s, and additional distance of modes of
 # two images, m; together they limit which modes a mode of unknown ancestry may continue.
-FASTEST, TREMBLE = 2.0, 0.05
+MAX_SPEED, MODE_JITTER = 2.0, 0.05
 
 
 class Evidence(NamedTuple):
@@ -102,6 +102,6 @@ def continued(
             origins = ancestry[:, [columns[name] for name in before.identities]]
     if origins is None:
         away = mean_distances(points[:, None], points_before)
-        reach = TREMBLE + FASTEST * (modes.stamp_ns - others.stamp_ns) / SECOND_NS
+        reach = MODE_JITTER + MAX_SPEED * (modes.stamp_ns - others.stamp_ns) / SECOND_NS
         origins = reachable_origins(away, others.link.weights, reach)
     return evidence._replace(modes=modes._replace(link=modes.link._replace(origins=origins)))

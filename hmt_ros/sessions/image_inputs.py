@@ -16,7 +16,7 @@ from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from hmt_ros.image.terms.depth import FURTHEST, NEAREST, usable_depths
+from hmt_ros.image.terms.depth import MAX_DEPTH, MIN_DEPTH, usable_depths
 from hmt_ros.inference.arrays import Image
 from hmt_ros.sessions.handled import HandlingLog
 from msg_tools.files.error_line import error_line
@@ -42,8 +42,12 @@ SOURCES = {
 T = TypeVar('T')
 
 # Maximum numbers of small and of image-sized inputs that wait; maximum sizes of a message, bytes.
-REMEMBERED, FEWER = 256, 64
-LARGEST, LARGEST_MASK, LARGEST_DEPTH = 2**24, MAX_PIXELS + 2**16, 4 * MAX_PIXELS + 2**16
+MAX_SMALL_INPUTS, MAX_LARGE_INPUTS = 256, 64
+MAX_MESSAGE_BYTES, MAX_MASK_BYTES, MAX_DEPTH_BYTES = (
+    2**24,
+    MAX_PIXELS + 2**16,
+    4 * MAX_PIXELS + 2**16,
+)
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,8 @@ class ImageInput:
         parameter: name of the parameter that makes images wait for the input; '': they always wait.
         read: function of a message and its stamp that returns the content, or None if it is empty;
             raises a one-line ValueError if the message can not be used.
-        told: whether an image without the input, and an input without an image, are reported.
+        report_missing: whether an image without the input, and an input without an image, are
+            reported.
         pixels: end of the error text if input and image differ in size, with a remedy or '';
             None: the input has no pixels.
         remembered: maximum number of inputs that wait for their image.
@@ -69,10 +74,10 @@ class ImageInput:
     types: Mapping[str, str]
     parameter: str
     read: Callable[[Any, int], Any] | None = None
-    told: bool = False
+    report_missing: bool = False
     pixels: str | None = None
-    remembered: int = REMEMBERED
-    largest: int = LARGEST
+    remembered: int = MAX_SMALL_INPUTS
+    largest: int = MAX_MESSAGE_BYTES
     reliable: bool = False
     together: bool = False
 
@@ -92,7 +97,7 @@ def _read_depth(message: Any, stamp: int) -> Any:
     depth = usable_depths(decode_depth(message))
     if not depth.any():
         raise ValueError(
-            f'depth of {stamp} ns has no value between {NEAREST:g} and {FURTHEST:g} m: wanted '
+            f'depth of {stamp} ns has no value between {MIN_DEPTH:g} and {MAX_DEPTH:g} m: wanted '
             '16UC1 in mm or 32FC1 in m'
         )
     return depth
@@ -107,20 +112,20 @@ MASK_INPUT = ImageInput(
     {MASK: IMAGE_TYPE, COMPRESSED_MASK: COMPRESSED_TYPE},
     'use_mask',
     _read_mask,
-    told=True,
+    report_missing=True,
     pixels='',
-    remembered=FEWER,
-    largest=LARGEST_MASK,
+    remembered=MAX_LARGE_INPUTS,
+    largest=MAX_MASK_BYTES,
 )
 DEPTH_INPUT = ImageInput(
     DEPTH,
     {DEPTH: IMAGE_TYPE},
     'use_depth',
     _read_depth,
-    told=True,
+    report_missing=True,
     pixels=': use depth that is registered to the colour camera',
-    remembered=FEWER,
-    largest=LARGEST_DEPTH,
+    remembered=MAX_LARGE_INPUTS,
+    largest=MAX_DEPTH_BYTES,
 )
 KEYPOINTS_INPUT = ImageInput(
     KEYPOINTS,
@@ -145,7 +150,7 @@ DETECTIONS_INPUT = ImageInput(
     DETECTIONS,
     {DETECTIONS: ''},
     '',
-    told=True,
+    report_missing=True,
 )
 
 # The table of inputs, in the order in which images wait for them.
@@ -158,7 +163,7 @@ class StampedInputs(Generic[T]):
     None represents an input without content, for example of a detector that saw nobody.
     """
 
-    def __init__(self, most: int = REMEMBERED) -> None:
+    def __init__(self, most: int = MAX_SMALL_INPUTS) -> None:
         self._most = most
         # Contents by stamp, in the order of arrival.
         self._content: dict[int, T | None] = {}
@@ -230,14 +235,14 @@ class ImageInputs:
         """
         taken = self._waiting[row.name].take_all(stamp_ns)
         content = taken.get(stamp_ns)
-        if row.told:
+        if row.report_missing:
             for each in (x for x in taken if x != stamp_ns and x not in dropped):
                 self._log.note(
                     f'{row.name} without an image',
                     f'{row.name} of {each} ns: no image with this stamp waits; wanted the stamp '
                     'of an image',
                 )
-        if row.told and stamp_ns not in taken:
+        if row.report_missing and stamp_ns not in taken:
             text = f'no {row.name} came for the image of {stamp_ns} ns'
             self._log.note(f'no {row.name}', text)
         if content is None or row.pixels is None or content.shape == image.shape[:2]:

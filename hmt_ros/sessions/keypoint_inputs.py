@@ -25,7 +25,7 @@ from hmt_ros.core import elementary
 from hmt_ros.experts.lifter import Lifter, load_lifter
 from hmt_ros.image.keypoint_schemes import AUTO, JOINTS, Scheme
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.sessions.declared_parameters import OWN_KEYPOINTS, CameraNodeParameters
+from hmt_ros.sessions.declared_parameters import OWN_SOURCE, CameraNodeParameters
 from hmt_ros.sessions.handled import HandlingLog
 from hmt_ros.sessions.image_inputs import DETECTIONS, KEYPOINTS_INPUT, SOURCES, ImageInput
 from hmt_ros.sessions.named_file import named_file
@@ -45,11 +45,11 @@ from msg_tools.messages.keypoints import Positions, keypoints_of
 # Value of `source` for messages of one person, in units of the image size.
 SKELETON = 'skeleton2d'
 # Time without the person after which the largest person is chosen again, s.
-LONGEST_ABSENCE = 1.0
+MAX_ABSENCE = 1.0
 # Maximum motion of a person between two images, relative to the size of the person.
-_FARTHEST = 1.0
+_MAX_MOTION = 1.0
 # Decay factor per image of the remembered size of a person, who may be partly hidden.
-_SIZE_KEPT = 0.95
+_SIZE_DECAY = 0.95
 
 
 def known_lifter(model: str) -> Lifter | None:
@@ -64,7 +64,7 @@ def known_lifter(model: str) -> Lifter | None:
 
 def keypoints_input(source: str) -> ImageInput:
     """Return the input of keypoints for a value of `source`."""
-    if source == OWN_KEYPOINTS:
+    if source == OWN_SOURCE:
         return KEYPOINTS_INPUT
     return replace(KEYPOINTS_INPUT, types={DETECTIONS: SOURCES[source]})
 
@@ -125,10 +125,10 @@ class ChosenPerson:
             self._size = 0.0
         else:
             chosen = min(seen, key=lambda keypoints: _distance(keypoints, last))
-            if _distance(chosen, last) > _FARTHEST * self._size:
+            if _distance(chosen, last) > _MAX_MOTION * self._size:
                 return None
         self._last, self._stamp = chosen, stamp_ns
-        self._size = max(_size(chosen), _SIZE_KEPT * self._size)
+        self._size = max(_size(chosen), _SIZE_DECAY * self._size)
         return chosen
 
 
@@ -226,7 +226,7 @@ class KeypointReader(DetectionReader):
         p: CameraNodeParameters,
         camera: Camera | None,
     ) -> Keypoints | None:
-        if self._source == OWN_KEYPOINTS:
+        if self._source == OWN_SOURCE:
             return keypoints_of(message)
         if stamp == 0 and self._source != SKELETON:
             raise MessageError('it comes before a camera_info, which gives its stamp')
@@ -238,7 +238,7 @@ class KeypointReader(DetectionReader):
             own = (x.keypoints for x in people if x.name == p.person_id and x.keypoints.seen.any())
             chosen = next(own, None)
         else:
-            chosen = self.chosen.choose(people, stamp, LONGEST_ABSENCE)
+            chosen = self.chosen.choose(people, stamp, MAX_ABSENCE)
         return None if chosen is None else chosen[np.flatnonzero(chosen.seen)]
 
     def at_joints(

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.detectors.detector import Detector
-from hmt_ros.detectors.people import STILL, PeopleDetector, SeenPerson
+from hmt_ros.detectors.people import PICTURE_TIME, PeopleDetector, SeenPerson
 from hmt_ros.detectors.registry import DETECTORS, USUAL_DETECTOR
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Mask
@@ -40,7 +40,7 @@ from msg_tools.messages.detections import (
 from msg_tools.messages.images import ImageError, image_message
 from msg_tools.messages.keypoints import keypoints_message, positions_message
 
-MOST_PEOPLE = 20
+MAX_PEOPLE = 20
 
 TOPICS = {
     KEYPOINTS: PublishedTopic(keypoints.KEYPOINTS_2D),
@@ -64,7 +64,7 @@ class KeypointsParameters(ImageNodeParameters):
 
     detector: str = parameter_field(USUAL_DETECTOR, NEXT_CONFIGURE)
     publish_mask: bool = parameter_field(False, NEXT_CONFIGURE)
-    people: int = parameter_field(0, NEXT_CONFIGURE, (0, MOST_PEOPLE))
+    people: int = parameter_field(0, NEXT_CONFIGURE, (0, MAX_PEOPLE))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -161,7 +161,8 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
             if one.still:
                 self._log.note(
                     f'{one.name} is still',
-                    f'nothing about {one.name} has changed for {STILL:g} s: a picture or a statue?',
+                    f'nothing about {one.name} has changed for {PICTURE_TIME:g} s: '
+                    'a picture or a statue?',
                 )
         if self._wanted(DETECTIONS):
             self._publish(

@@ -17,7 +17,7 @@ from hmt_ros.experts import lifter, pose_predictor
 from msg_tools.files.error_line import error_line, one_line
 
 # Parameters that may name a file, each with a function that returns the names that are not files.
-FILES: Mapping[str, Callable[[], Collection[str]]] = {
+FILE_PARAMETERS: Mapping[str, Callable[[], Collection[str]]] = {
     'subject_file': tuple,
     'background_file': tuple,
     'body_model': model_names,
@@ -70,7 +70,7 @@ def check_place(parameter: str, path: str, folders: Collection[str]) -> None:
         ValueError: the file is in none of the folders (whether or not it exists), or is not a
             regular file.
     """
-    names = ['', *FILES[parameter]()]
+    names = ['', *FILE_PARAMETERS[parameter]()]
     if path in names:
         return
     real = Path(os.path.realpath(path))

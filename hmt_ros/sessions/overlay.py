@@ -14,11 +14,11 @@ import numpy as np
 from hmt_ros.body import Camera
 from hmt_ros.inference.arrays import Array, Image
 
-_FIRST, _OTHERS = (13, 115, 230), (204, 115, 26)  # BGR
-_FAINTEST = 0.2
-_SHIFT = 4  # fractional bits of coordinates
+_FIRST_COLOUR, _OTHER_COLOUR = (13, 115, 230), (204, 115, 26)  # BGR
+_MIN_OPACITY = 0.2
+_FRACTIONAL_BITS = 4  # fractional bits of coordinates
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-_FAR = 2.0**14  # maximum coordinate, px; OpenCV draws no line that begins further away
+_MAX_COORDINATE = 2.0**14  # maximum coordinate, px; OpenCV draws no line that begins further away
 
 
 def draw_modes(
@@ -44,7 +44,9 @@ def draw_modes(
         return result
     thickness = max(round(min(image.shape[:2]) / 240), 1)
     pixels = camera.project(joints[order])
-    usable = np.logical_and.reduce(np.abs(np.nan_to_num(pixels, nan=np.inf)) < _FAR, axis=2)
+    usable = np.logical_and.reduce(
+        np.abs(np.nan_to_num(pixels, nan=np.inf)) < _MAX_COORDINATE, axis=2
+    )
     # The heaviest mode is drawn last, on top.
     for rank in reversed(range(len(order))):
         lines = [(a, b) for a, b in bones if usable[rank, a] and usable[rank, b]]
@@ -55,19 +57,21 @@ def draw_modes(
         part = result[top:bottom, left:right]
         layer = part.copy()
         fixed = np.zeros(pixels[rank].shape, dtype=int)
-        fixed[usable[rank]] = np.rint((pixels[rank][usable[rank]] - [left, top]) * 2**_SHIFT)
+        fixed[usable[rank]] = np.rint(
+            (pixels[rank][usable[rank]] - [left, top]) * 2**_FRACTIONAL_BITS
+        )
         for start, end in lines:
             cv2.line(
                 layer,
                 fixed[start].tolist(),
                 fixed[end].tolist(),
-                _OTHERS if rank else _FIRST,
+                _OTHER_COLOUR if rank else _FIRST_COLOUR,
                 thickness + (rank == 0),
                 cv2.LINE_AA,
-                _SHIFT,
+                _FRACTIONAL_BITS,
             )
         share = float(weights[order[rank]] / weights[order[0]]) if weights[order[0]] > 0 else 1.0
-        strength = _FAINTEST + (1 - _FAINTEST) * share
+        strength = _MIN_OPACITY + (1 - _MIN_OPACITY) * share
         cv2.addWeighted(layer, strength, part, 1 - strength, 0.0, dst=part)
     return result
 

@@ -12,7 +12,7 @@ from hmt_ros.sessions.declared_parameters import Value
 from msg_tools.files.plain_yaml import read_plain_yaml
 
 PARAMETERS_KEY = 'ros__parameters'
-LARGEST_FILE = 250_000  # bytes
+MAX_FILE_BYTES = 250_000  # bytes
 
 
 def yaml_scalar(value: Value) -> str:
@@ -37,7 +37,7 @@ def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -
     """
     path = Path(path)
     try:
-        document = read_plain_yaml(path, LARGEST_FILE)
+        document = read_plain_yaml(path, MAX_FILE_BYTES)
     except ValueError as error:
         raise ValueError(f'{path}: {error}') from error
     if document is None:

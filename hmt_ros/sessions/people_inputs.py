@@ -10,7 +10,7 @@ import numpy as np
 
 from hmt_ros.body import Body
 from hmt_ros.image.association import Sighting
-from hmt_ros.image.keypoint_evidence import FEWEST_KEYPOINTS
+from hmt_ros.image.keypoint_evidence import MIN_KEYPOINTS
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.handled import HandlingLog
 from hmt_ros.sessions.keypoint_inputs import DetectionReader
@@ -38,7 +38,7 @@ class Found:
     @property
     def suffices(self) -> bool:
         """Whether the detection is enough to start a track."""
-        return self.detected.box is not None or len(self.keypoints.names) >= FEWEST_KEYPOINTS
+        return self.detected.box is not None or len(self.keypoints.names) >= MIN_KEYPOINTS
 
 
 class PeopleReader(DetectionReader):

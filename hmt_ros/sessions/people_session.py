@@ -27,7 +27,7 @@ from hmt_ros.body import Camera
 from hmt_ros.body.camera_pose import CameraPose
 from hmt_ros.core import elementary
 from hmt_ros.image.association import (
-    GATE,
+    GATE_COST,
     ImageTrack,
     Sighting,
     assigned,
@@ -54,7 +54,7 @@ from hmt_ros.sessions.overlay import draw_modes, draw_notes
 from hmt_ros.sessions.people_inputs import Found, PeopleReader
 from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.sessions.track import BODIES, Seen, Track, person_of
-from hmt_ros.sessions.track_messages import OVERLAY_MODES, TOPICS_OF_NODE, notes_of
+from hmt_ros.sessions.track_messages import MAX_OVERLAY_MODES, TOPICS_OF_NODE, notes_of
 from hmt_ros.sessions.track_start import TrackStart
 from hmt_ros.sessions.tracking_parameters import FilterParameters, PeopleParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
@@ -86,9 +86,9 @@ def session_of(parameters: FilterParameters) -> type[TrackingSession]:
 
 
 # Minimum width and height in the image of a person whose track starts, px.
-SMALLEST = 4
+MIN_SIZE = 4
 # Time without a detection after which a person without a track is dropped, s.
-UNSTARTED = 0.5
+MAX_UNSTARTED_TIME = 0.5
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ class PeopleSession(TrackingSession):
             self._scene = Silhouettes(self._background_for(camera))
         if (pose := self.frames.pose) is not None:
             # The background depends on the pose of the camera.
-            self._scene.see_from(CameraPose.of(pose.translation, pose.rotation), camera)
+            self._scene.set_camera_pose(CameraPose.of(pose.translation, pose.rotation), camera)
         found: list[Found] = []
         if detected is not None:
             found = self._reader.found(
@@ -237,7 +237,7 @@ class PeopleSession(TrackingSession):
         if self._scene.scene.known:
             self._look_at_scene(waiting, self._scene.background, 'call ~/reset')
         yield from self._nearest_first(waiting, camera, own, left, detected is not None)
-        self._drop_those_who_left(stamp)
+        self._drop_lost_people(stamp)
         if detected is not None:
             if self._wanted(PEOPLE):
                 self._publish_people(waiting, camera)
@@ -281,10 +281,10 @@ class PeopleSession(TrackingSession):
         p, size = self.parameters, (camera.width, camera.height)
         for one in sorted(left, key=lambda x: -x.sighting.size):
             corners = np.clip(np.rint(one.sighting.corners), 0, size).astype(int)
-            if not one.suffices or (corners[1] - corners[0]).min() < SMALLEST:
+            if not one.suffices or (corners[1] - corners[0]).min() < MIN_SIZE:
                 continue
             costs = [x.place.cost(one.sighting, stamp) for x in own if own[x] is not one]
-            if min(costs, default=GATE) < 0.5 * GATE:
+            if min(costs, default=GATE_COST) < 0.5 * GATE_COST:
                 continue  # a second detection of the same person
             if len(self.tracks) >= p.max_people:
                 self._log.note(
@@ -342,12 +342,12 @@ class PeopleSession(TrackingSession):
             if (area := person.area(camera)) is not None:
                 areas[person] = area
 
-    def _drop_those_who_left(self, stamp: int) -> None:
+    def _drop_lost_people(self, stamp: int) -> None:
         self.tracks = tuple(
             person
             for person in self.tracks
             if person.status is not Status.NOBODY
-            and (person.begun or stamp - person.place.stamp <= UNSTARTED * SECOND_NS)
+            and (person.begun or stamp - person.place.stamp <= MAX_UNSTARTED_TIME * SECOND_NS)
         )
 
     def _publish_people(self, waiting: WaitingImage, camera: Camera) -> None:
@@ -401,7 +401,7 @@ class PeopleSession(TrackingSession):
             picture = waiting.image
             for joints, found in modes.values():
                 weights = elementary.exp(found.log_weights)
-                picture = draw_modes(picture, camera, joints, bones, weights, OVERLAY_MODES)
+                picture = draw_modes(picture, camera, joints, bones, weights, MAX_OVERLAY_MODES)
             notes = [f'{len(modes)} of {self._detected} people', *notes_of(self.parameters)]
             message = compressed_image_message(
                 self._messages, draw_notes(picture, notes), stamp, frame

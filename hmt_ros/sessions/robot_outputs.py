@@ -27,9 +27,9 @@ from msg_tools.messages.keep_out import KeepOut, KeepOutState
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, TrackState
 
 # Maximum time from the newest image to a forecast, s: later a person may be anywhere.
-LONGEST_FORECAST = 10.0
+MAX_FORECAST_TIME = 10.0
 # Maximum number of forecasts per image: after a gap the earliest are of no use.
-MOST_FORECASTS = 100
+MAX_FORECASTS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class LastSeen:
 
 
 @dataclass(frozen=True)
-class _Told:
+class _NewestResult:
     """Result of the newest image; replaced as a whole, so that any thread may read it."""
 
     state: KeepOutState = KeepOutState.UNKNOWN
@@ -94,9 +94,9 @@ class RobotOutputs:
 
     def forget(self) -> None:
         """Forgets all images."""
-        self._told, self._forecast_until = _Told(), 0
+        self._told, self._forecast_until = _NewestResult(), 0
 
-    def tell(
+    def update(
         self,
         stamp_ns: int,
         frame_id: str,
@@ -120,7 +120,9 @@ class RobotOutputs:
         elif state is KeepOutState.UNKNOWN and before is not None:
             # The track was dropped, but its person may still be there.
             state = KeepOutState.LOST
-        self._told = _Told(state, stamp_ns, frame_id, track_id, existence, seen or before, reason)
+        self._told = _NewestResult(
+            state, stamp_ns, frame_id, track_id, existence, seen or before, reason
+        )
 
     def keep_out(self, probability: float, silence: float | None = None) -> KeepOut:
         """Return the space to keep out of.
@@ -160,16 +162,16 @@ class RobotOutputs:
 
         Raises:
             ValueError: nobody is tracked, or the time is before the newest image or more than
-                `LONGEST_FORECAST` after it.
+                `MAX_FORECAST_TIME` after it.
         """
         told = self._told
         seen = told.seen
         if seen is None:
             raise ValueError('nobody is tracked')
-        if not told.stamp_ns <= stamp_ns <= told.stamp_ns + LONGEST_FORECAST * SECOND_NS:
+        if not told.stamp_ns <= stamp_ns <= told.stamp_ns + MAX_FORECAST_TIME * SECOND_NS:
             raise ValueError(
                 f'the newest image is of {told.stamp_ns} ns; wanted a time from then to '
-                f'{LONGEST_FORECAST:g} s later, saw {stamp_ns} ns'
+                f'{MAX_FORECAST_TIME:g} s later, saw {stamp_ns} ns'
             )
         mixture = with_depth_error(seen.forecaster.at(stamp_ns), seen.focal_length_sigma)
         body, frame = seen.body, seen.frame_id
@@ -205,6 +207,6 @@ class RobotOutputs:
         until = told.stamp_ns + round(horizon * SECOND_NS)
         last = int(until // every)
         first = int(max(self._forecast_until, told.stamp_ns) // every) + 1
-        first = max(first, last + 1 - MOST_FORECASTS)
+        first = max(first, last + 1 - MAX_FORECASTS)
         self._forecast_until = max(until, self._forecast_until)
         return (math.ceil(k * every) for k in range(first, last + 1))

@@ -13,7 +13,7 @@ from hmt_ros.image.image_sequence import SeenImage
 
 # Maximum memory of the images of a window, MB; 47 images of 640 x 480 pixels that the person fills
 # take 80 MB.
-MOST_MB = 256
+MAX_MEGABYTES = 256
 
 
 class SeenImages:
@@ -26,7 +26,7 @@ class SeenImages:
         wanted: maximum number of images; the newest are kept.
     """
 
-    def __init__(self, most_mb: float = MOST_MB) -> None:
+    def __init__(self, most_mb: float = MAX_MEGABYTES) -> None:
         self.most_mb, self.wanted = most_mb, 0
         self._kept: dict[int, tuple[SeenImage, int]] = {}
         self._lock = threading.Lock()

@@ -31,10 +31,10 @@ from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.images import decode_image
 
 # Prefix of the diagnostics key for the number of subscribers of a topic.
-SUBSCRIBERS = 'subscribers of '
+SUBSCRIBERS_KEY = 'subscribers of '
 FINISH = 'finish'  # source of the report of `finish`, at the end of the stream
 TIME_JUMP = 'time jumps back'  # kind of fault
-_MOST_STREAMS = 1000  # maximum number of sources whose order is remembered
+_MAX_STREAMS = 1000  # maximum number of sources whose order is remembered
 _LATEST_NS = 2**31 * SECOND_NS  # first stamp beyond the range of a message, ns
 
 
@@ -216,7 +216,7 @@ class Session(ABC, Generic[Parameters, State]):
         else:
             self._take(source, message, stamp)
         if not more:
-            self._use_what_has_come()
+            self._estimate_from_inputs()
         return self._handled(source, stamp)
 
     def needed_inputs(self) -> list[NeededInput]:
@@ -243,7 +243,7 @@ class Session(ABC, Generic[Parameters, State]):
         self._log.begin()
         self._log.fault('message', f'message of {source} can not be read: {text}')
         if not more:
-            self._use_what_has_come()
+            self._estimate_from_inputs()
         return self._handled(source, stamp)
 
     def drop(self, stamp_ns: int) -> Handled:
@@ -270,7 +270,7 @@ class Session(ABC, Generic[Parameters, State]):
     def _take(self, source: str, message: Any, stamp: int) -> None:
         """Handles a message; `take` returns the report."""
 
-    def _use_what_has_come(self) -> None:
+    def _estimate_from_inputs(self) -> None:
         """Estimates from the messages that `_take` has stored."""
 
     def _drop(self, stamp_ns: int) -> None:
@@ -315,7 +315,7 @@ class Session(ABC, Generic[Parameters, State]):
     def _turn_of(self, source: str, one: Stamped) -> Turn:
         """Add a message to the order; return the messages to use; restart if time jumps back."""
         order = self._orders.setdefault(source, StampOrder())
-        if len(self._orders) > _MOST_STREAMS:
+        if len(self._orders) > _MAX_STREAMS:
             del self._orders[next(iter(self._orders))]
         newest = order.newest
         turn = order.put(one, expected=self.parameters.reset_on_time_jump)

@@ -34,9 +34,9 @@ TOPICS = {
     'smoothed_joint_states': PublishedTopic('sensor_msgs/msg/JointState'),
     '/tf': PublishedTopic('tf2_msgs/msg/TFMessage'),
 }
-TRACED = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')
+TRACED_JOINTS = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')
 # Maximum number of trajectories that are drawn, heaviest first.
-DRAWN = 8
+MAX_DRAWN_TRAJECTORIES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ def window_messages(
         yield 'trajectory_mixture', trajectory_mixture_message(MESSAGES, content)
     if wanted('trajectory_markers'):
         assert found.stamps_ns is not None
-        chosen = np.argsort(-found.weights, kind='stable')[:DRAWN]
+        chosen = np.argsort(-found.weights, kind='stable')[:MAX_DRAWN_TRAJECTORIES]
         joints, stamp = _joints(found.means[chosen], of.body), found.stamps_ns[-1]
         yield 'trajectory_markers', _markers(of, joints, found.weights[chosen], stamp)
 
@@ -205,7 +205,15 @@ def _markers(of: SmoothedBody, joints: Array, weights: Array, stamp_ns: int) -> 
     names = of.body.joint_names
     edges = [(names[a], names[b]) for a, b in of.body.skeleton.bones]
     return trajectory_markers(
-        MESSAGES, joints, names, TRACED, edges, weights, stamp_ns, of.frame_id, ranks=DRAWN
+        MESSAGES,
+        joints,
+        names,
+        TRACED_JOINTS,
+        edges,
+        weights,
+        stamp_ns,
+        of.frame_id,
+        ranks=MAX_DRAWN_TRAJECTORIES,
     )
 
 

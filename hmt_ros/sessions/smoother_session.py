@@ -23,7 +23,7 @@ The rules, in addition to those of `Session`:
   in the frame of a camera that is rotated by quarter turns; this begins a new window.
 - Cyclic angles are unwrapped from mixture to mixture, each mode relative to the nearest previous
   mode, because the dynamics would treat a whole turn as a jump.
-- The dynamics bridge gaps. Gaps longer than `LONGEST_INTERVAL` are reported.
+- The dynamics bridge gaps. Gaps longer than `MAX_INTERVAL` are reported.
 """
 
 from __future__ import annotations
@@ -70,16 +70,16 @@ from msg_tools.messages.pose_mixtures import (
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 
 MIXTURE, TRAJECTORIES = 'likelihood_mixture', 'trajectory_mixture'
-NOBODY = 'nobody'  # status while nobody is in view
+NOBODY_STATUS = 'nobody'  # status while nobody is in view
 # Maximum change of a segment length between two mixtures of the same person, m.
-SAME_PERSON = 0.02
+LENGTH_TOLERANCE = 0.02
 # Minimum time between two smoothings: SHARE_OF_LAG times the lag, but at most RARELY, s.
-SHARE_OF_LAG, RARELY = 0.2, 0.1
+INTERVAL_OF_LAG, MAX_MIN_INTERVAL = 0.2, 0.1
 # Maximum interval between two mixtures that is not reported as a gap, s.
-LONGEST_INTERVAL = 0.25
+MAX_INTERVAL = 0.25
 # Factor on the diffusion of the filter's motion prior, chosen on clips (docs/smoothing.md): sudden
 # motion is more frequent than a Gaussian with the mean variance predicts.
-LIVELINESS = 2.0
+DIFFUSION_FACTOR = 2.0
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class SmootherState(SessionState):
     Attributes:
         window: number of poses in the window.
         trajectories: number of components of the mixture over trajectories.
-        gaps: number of intervals between mixtures that were longer than `LONGEST_INTERVAL`.
+        gaps: number of intervals between mixtures that were longer than `MAX_INTERVAL`.
         longest_gap: longest of these intervals, s.
     """
 
@@ -104,7 +104,7 @@ class SmootherState(SessionState):
 
     def trouble(self) -> str:
         """Return 'nobody in view', or '' if somebody is in view."""
-        return 'nobody in view' if self.status == NOBODY else ''
+        return 'nobody in view' if self.status == NOBODY_STATUS else ''
 
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
@@ -117,7 +117,7 @@ class SmootherState(SessionState):
         ]
 
 
-def untold(text: str) -> None:
+def ignore_event(text: str) -> None:
     """Ignores a report."""
 
 
@@ -163,7 +163,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         stamp = self._newest or 0
         asked = self.parameters.refine_on_images == AT_END and self._wanted(TRAJECTORIES)
         if asked and self.kept.items:
-            self._publish(TRAJECTORIES, stamp, self.smooth_span(tell=self._log.tell))
+            self._publish(TRAJECTORIES, stamp, self.smooth_span(notify=self._log.add_event))
         self._end_window()
         self._orders.clear()
         return stamp
@@ -189,7 +189,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             if content.kind is MixtureKind.LIKELIHOOD and not len(content.weights):
                 self._take_nobody(stamp, content.existence_probability)
                 return
-            evidence, of = evidence_of(content), self._whose(content)
+            evidence, of = evidence_of(content), self._person_of(content)
             of = self._clear(of, evidence.modes.mixture)
         except MessageError as error:
             self._log.skip(error.fault, f'mixture of {stamp} ns: {error}')
@@ -213,7 +213,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         p = self.parameters
         if self._newest is not None:
             interval = (stamp - self._newest) / SECOND_NS
-            if interval > LONGEST_INTERVAL:
+            if interval > MAX_INTERVAL:
                 self._gaps += 1
                 self._longest_gap = max(self._longest_gap, interval)
                 self._log.note(
@@ -226,7 +226,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 self._smoother(of.body),
                 p.fixed_lag,
                 first_identity=self._first_identity,
-                every=min(SHARE_OF_LAG * p.fixed_lag, RARELY),
+                every=min(INTERVAL_OF_LAG * p.fixed_lag, MAX_MIN_INTERVAL),
             )
         try:
             update = self._window.step(evidence.modes)
@@ -271,11 +271,11 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._end_window()
         self._nobody = True
         if of is not None and smooths:
-            self._log.tell(f'nobody in view at the mixture of {stamp} ns: the window ends')
+            self._log.add_event(f'nobody in view at the mixture of {stamp} ns: the window ends')
             for topic, made in nobody_messages(of, stamp, existence, self._wanted):
                 self._publish(topic, stamp, made)
 
-    def _whose(self, content: PoseMixture) -> SmoothedBody:
+    def _person_of(self, content: PoseMixture) -> SmoothedBody:
         """Return the person of a mixture; it is the same object while the person does not change.
 
         Raises:
@@ -331,7 +331,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         p = self.parameters
         prior = motion_prior(body)
         return MotionSmoother(
-            replace(prior, diffusion=LIVELINESS * prior.diffusion),
+            replace(prior, diffusion=DIFFUSION_FACTOR * prior.diffusion),
             *free_limits(body),
             points=body.relative_joints,
             max_motions=p.max_hypotheses,
@@ -362,7 +362,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             self._publish(topic, pose.stamp_ns, made)
 
     def smooth_span(
-        self, from_ns: int = 0, to_ns: int = 0, tell: Callable[[str], None] = untold
+        self, from_ns: int = 0, to_ns: int = 0, notify: Callable[[str], None] = ignore_event
     ) -> Any:
         """Smooths the kept mixtures of a span of time, all at once.
 
@@ -371,8 +371,8 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         Args:
             from_ns, to_ns: first and last stamp, inclusive, ns; 0 selects the oldest and the newest
                 mixture.
-            tell: function that is called with a line that says whether images refined the motions,
-                or why they did not.
+            notify: function that is called with a line that says whether images refined the
+                motions, or why they did not.
 
         Returns:
             hmt_msgs/TrajectoryMixture with covariances.
@@ -380,13 +380,13 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         Raises:
             ValueError: the span has no mixtures, or they can not be smoothed.
         """
-        found, of = self.smoothed_span(from_ns, to_ns, tell)
+        found, of = self.smoothed_span(from_ns, to_ns, notify)
         shapes = _shapes((one.modes.stamp_ns, one.shape) for one in self.kept.items)
         content = trajectory_content(found, of, covariances=True, shapes=shapes)
         return trajectory_mixture_message(self._messages, content)
 
     def smoothed_span(
-        self, from_ns: int = 0, to_ns: int = 0, tell: Callable[[str], None] = untold
+        self, from_ns: int = 0, to_ns: int = 0, notify: Callable[[str], None] = ignore_event
     ) -> tuple[TrajectoryMixture, SmoothedBody]:
         """Return the trajectories of a span of time, and their person; see `smooth_span`."""
         of, items = self.kept
@@ -404,18 +404,18 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         smoother = self._smoother(of.body)
         found = smoother.motions(chosen)
         if self.parameters.refine_on_images == NEVER:
-            tell('smoothed without images, as refine_on_images says')
+            notify('smoothed without images, as refine_on_images says')
             return found.trajectories, of
         stamps = [modes.stamp_ns for modes in chosen]
         images = [one.levelled(of.body.level) for one in self._images.of(stamps) if one is not None]
         if len(images) < len(stamps):
-            tell(
+            notify(
                 f'smoothed without images: {len(stamps) - len(images)} of {len(stamps)} are not '
                 'kept, as the filter runs in another process or publishes in fixed_frame, or as '
                 f'they take more than {self._images.most_mb:g} MB'
             )
             return found.trajectories, of
-        tell(f'motions are refined on {len(images)} images')
+        notify(f'motions are refined on {len(images)} images')
         sequence = ImageSequence.of(images, stamps, of_changes=True)
         return refined_on_images(smoother, found, sequence), of
 
@@ -425,7 +425,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         smooths = self._newest is not None
         status, wants = ('smoothing', '') if smooths else ('waiting', 'likelihood_mixture')
         if self._nobody:
-            status, wants = NOBODY, ''
+            status, wants = NOBODY_STATUS, ''
         return SmootherState(
             status,
             wants,
@@ -468,5 +468,5 @@ def _same(one: SmoothedBody, other: SmoothedBody) -> bool:
         same_track
         and one.frame_id == other.frame_id
         and np.array_equal(one.body.level, other.body.level)
-        and resembles(one.body, other.body, SAME_PERSON)
+        and resembles(one.body, other.body, LENGTH_TOLERANCE)
     )

@@ -13,10 +13,10 @@ from msg_tools.messages.headers import SECOND_NS
 
 # Number of messages in a row that confirm another time, and minimum step back of a clock, ns: a
 # stream soon catches up with a shorter step. EXPECTED is used if the clock may go back.
-AGREEING, EXPECTED = (3, SECOND_NS), (2, 0)
+CONFIRMING_MESSAGES, EXPECTED_JUMP = (3, SECOND_NS), (2, 0)
 # Maximum step ahead without confirmation by other messages, ns, and in intervals of the stream; the
 # larger one applies.
-_AHEAD_NS, _INTERVALS = SECOND_NS, 5
+_MIN_STEP_AHEAD_NS, _MIN_INTERVALS_AHEAD = SECOND_NS, 5
 
 
 class Stamped(NamedTuple):
@@ -62,7 +62,7 @@ class StampOrder:
             expected: whether the clock may go back, for example when a bag is played again.
         """
         newest, aside = self.newest, self._aside
-        agreeing, least_back = EXPECTED if expected else AGREEING
+        agreeing, least_back = EXPECTED_JUMP if expected else CONFIRMING_MESSAGES
         if newest is None or newest < one.stamp <= newest + self._longest():
             self._aside = ()
             return self._used((one,), stray=aside)
@@ -88,7 +88,11 @@ class StampOrder:
     def _longest(self) -> float:
         """Return the maximum interval to the next message that is not a jump, ns."""
         interval = self._interval
-        return float('inf') if interval is None else max(_AHEAD_NS, _INTERVALS * interval)
+        return (
+            float('inf')
+            if interval is None
+            else max(_MIN_STEP_AHEAD_NS, _MIN_INTERVALS_AHEAD * interval)
+        )
 
     def _used(self, use: tuple[Stamped, ...], **turn: Any) -> Turn:
         before = use[-2].stamp if len(use) > 1 else self.newest

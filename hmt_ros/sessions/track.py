@@ -46,7 +46,7 @@ from msg_tools.messages.keep_out import KeepOutState
 
 BODIES = 'humans/bodies'
 # Maximum change of a segment length without a new body message, m.
-RESHAPED = 0.005
+MAX_LENGTH_CHANGE = 0.005
 _STATES = {
     Status.WAITING: KeepOutState.UNKNOWN,
     Status.TRACKING: KeepOutState.TRACKING,
@@ -190,7 +190,7 @@ class Track:
                 depth=waiting.depth,
             )
             report_change(log, before, tracker, self.start.initial, stamp)
-            if waiting.depth is not None and not tracker.estimate.validity.believes('depth'):
+            if waiting.depth is not None and not tracker.estimate.validity.is_trusted('depth'):
                 log.note(
                     'depth of something else',
                     f'depth of {stamp} ns does not show the person where the image does: depth '
@@ -275,7 +275,9 @@ class Track:
         likelihood: GaussianMixture,
     ) -> bool:
         p, fixed = self._parameters, self._fixed_frame()
-        starts = self.body is None or not resembles(tracker.estimate.body, self.body, RESHAPED)
+        starts = self.body is None or not resembles(
+            tracker.estimate.body, self.body, MAX_LENGTH_CHANGE
+        )
         if starts:
             self.body = tracker.estimate.body
         if fixed is not None:
@@ -356,7 +358,7 @@ class Track:
         number = self._last_id if tracker is None else tracker.track_id
         frame = p.fixed_frame if p.publish_in_fixed_frame else waiting.frame_id
         with self._shared.answering:
-            self.robot.tell(waiting.stamp_ns, frame, state, number, existence, seen, reason)
+            self.robot.update(waiting.stamp_ns, frame, state, number, existence, seen, reason)
             for made in robot_messages(self.robot, p, self._wants):
                 self._put_out(made.topic, made.stamp_ns, made.message)
             self._shared.answered += 1

@@ -20,7 +20,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import product
 from hmt_ros.sessions.camera_session import WaitingImage
-from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
+from hmt_ros.sessions.fixed_frame import OPTICAL_TO_BODY, FixedFrame, upright
 from hmt_ros.sessions.focal_length import depth_covariances
 from hmt_ros.sessions.handled import Output
 from hmt_ros.sessions.overlay import draw_modes, draw_notes
@@ -67,10 +67,10 @@ TOPICS_OF_NODE = {
 }
 
 # Name, without prefix, of the frame at the camera with x forward and z up; requires gravity.
-UPRIGHT = 'camera_upright'
+UPRIGHT_FRAME = 'camera_upright'
 MESSAGES = RosbagsMessages()
 # Maximum number of modes drawn on the image, heaviest first.
-OVERLAY_MODES = 3
+MAX_OVERLAY_MODES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
             joints,
             skeleton.bones,
             posterior.weights,
-            OVERLAY_MODES,
+            MAX_OVERLAY_MODES,
         )
         drawn = draw_notes(drawn, notes_of(p))
         yield 'overlay/compressed', compressed_image_message(MESSAGES, drawn, stamp, frame)
@@ -330,10 +330,10 @@ def _link_transforms(track: TrackedImage) -> Any:
     frames = [(camera, f'{prefix}{name}', *place) for name, *place in links]
     if tracker.estimate.vertical is not None:
         frames.append(
-            (camera, f'{prefix}{UPRIGHT}', upright(tracker.estimate.vertical), np.zeros(3))
+            (camera, f'{prefix}{UPRIGHT_FRAME}', upright(tracker.estimate.vertical), np.zeros(3))
         )
     if track.fixed is not None:
-        frames.append((track.fixed.name, track.fixed.optical, FROM_OPTICAL, np.zeros(3)))
+        frames.append((track.fixed.name, track.fixed.optical, OPTICAL_TO_BODY, np.zeros(3)))
     parents, children, rotations, origins = zip(*frames, strict=True)
     stamp = track.waiting.stamp_ns
     return transforms_message(MESSAGES, parents, children, rotations, origins, stamp)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
-from hmt_ros.sessions.camera_session import IN_BACKGROUND, camera_moved_fault
+from hmt_ros.sessions.camera_session import PERSON_IN_BACKGROUND_FAULT, camera_moved_fault
 from hmt_ros.sessions.handled import HandlingLog
 from hmt_ros.tracking import Status, Subject, Tracker
 from hmt_ros.tracking.beginning import Source
@@ -70,9 +70,9 @@ def report_change(
     if now.doubted and not before.doubted:
         log.note(
             'background',
-            f'{IN_BACKGROUND}, as the image of {stamp_ns} ns shows: silhouettes are not used '
-            'until the scene behind the person has been seen; give background_file, or start '
-            'with the empty scene',
+            f'{PERSON_IN_BACKGROUND_FAULT}, as the image of {stamp_ns} ns shows: silhouettes are '
+            'not used until the scene behind the person has been seen; give background_file, or '
+            'start with the empty scene',
         )
     if now.moved and not before.moved:
         remedy = 'call ~/reset; a moving camera needs fixed_frame or use_mask'
@@ -124,18 +124,18 @@ def _report_status(
     now, track = tracker.estimate.status, f'track {tracker.track_id}'
     at = f'at the image of {stamp_ns} ns'
     if now is Status.NOBODY:
-        log.tell(f'nobody in view {at}: {track} ends, another starts when somebody comes')
+        log.add_event(f'nobody in view {at}: {track} ends, another starts when somebody comes')
     elif now is Status.WAITING:
-        log.tell(f'{track} ends {at}: the person in view may be somebody else')
+        log.add_event(f'{track} ends {at}: the person in view may be somebody else')
     elif tracker.track_id == before.track_id and before.status is Status.LOST:
-        log.tell(f'{track} is found again {at}')
+        log.add_event(f'{track} is found again {at}')
     elif tracker.track_id != before.track_id:
         origin = (
             'what was given'
             if tracker.estimate.started_from is None
             else tracker.estimate.started_from.value
         )
-        log.tell(f'{track} starts from {origin} {at}')
+        log.add_event(f'{track} starts from {origin} {at}')
         if isinstance(initial, Subject) and before.status is Status.WAITING:
             age = stamp_ns - initial.stamp_ns
             if age > _SAME_MOMENT_NS:

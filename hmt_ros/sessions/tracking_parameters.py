@@ -23,7 +23,7 @@ from hmt_ros.tracking.ground import KnownGround
 # Chosen by accuracy and time on tracked clips.
 LIVE_BUDGET = 300
 # Settings that are parameters, with their limits.
-_TRACKER = {
+_TRACKER_SETTINGS = {
     'evaluation_budget': (1, 100_000),
     'max_hypotheses': (1, 64),
     'lifter': None,
@@ -104,7 +104,7 @@ class FilterParameters(CameraNodeParameters):
     forecast_horizon: float = parameter_field(0.15, AT_ONCE, (0.0, 10.0))
     tracker: TrackerSettings = field(
         default_factory=lambda: TrackerSettings(evaluation_budget=LIVE_BUDGET),
-        metadata=nested_parameters(NEXT_TRACK, _TRACKER),
+        metadata=nested_parameters(NEXT_TRACK, _TRACKER_SETTINGS),
     )
 
     def __post_init__(self) -> None:
@@ -145,7 +145,7 @@ class FilterParameters(CameraNodeParameters):
 
 
 # Inputs of a single person, whose topics can not tell which person it is.
-_OF_ONE = {
+_ONE_PERSON_INPUTS = {
     'subject_file': '',
     'use_predictions': False,
     'use_keypoints_3d': False,
@@ -178,7 +178,7 @@ class PeopleParameters(FilterParameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, unused in _OF_ONE.items():
+        for name, unused in _ONE_PERSON_INPUTS.items():
             if getattr(self, name) != unused:
                 raise ValueError(
                     f'{name} is {getattr(self, name)!r}, but people_node takes no input of one '

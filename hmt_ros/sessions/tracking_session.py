@@ -17,8 +17,8 @@ from typing import Any, ClassVar
 from hmt_ros.body import Body, Camera
 from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.camera_session import (
-    CAMERA_MOVED,
-    IN_BACKGROUND,
+    CAMERA_MOVED_FAULT,
+    PERSON_IN_BACKGROUND_FAULT,
     CameraSession,
     CameraState,
     WaitingImage,
@@ -85,8 +85,8 @@ class TrackingState(CameraState):
             return 'nobody in view'
         if self.status == Status.LOST.value:
             lost = f'lost: misfit {self.misfit:.2f}, existence {self.existence:.2f}'
-            return f'{lost}; {CAMERA_MOVED}' if self.moved else lost
-        learned = f'{IN_BACKGROUND}; {self.background}' if self.doubted else ''
+            return f'{lost}; {CAMERA_MOVED_FAULT}' if self.moved else lost
+        learned = f'{PERSON_IN_BACKGROUND_FAULT}; {self.background}' if self.doubted else ''
         return super().trouble() or learned
 
     def values(self) -> list[tuple[str, str]]:
@@ -180,7 +180,7 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
         return pose_mixture_message(self._messages, self.tracks[0].robot.forecast(stamp_ns))
 
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
-        for kind, text in self.frames.look(waiting.frame_id, waiting.stamp_ns):
+        for kind, text in self.frames.update(waiting.frame_id, waiting.stamp_ns):
             self._log.note(kind, text)
         outcomes = set()
         for track, seen in self._people_in(waiting, camera):

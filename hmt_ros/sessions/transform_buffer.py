@@ -26,14 +26,14 @@ TRANSFORMS_TYPE = 'tf2_msgs/msg/TFMessage'
 
 # Time for which places of moving frames are kept, as in tf2, s; maximum numbers of frames, and of
 # stamps per frame.
-REMEMBERED = 10.0
-MOST_FRAMES, MOST_STAMPS = 1000, 10_000
+MEMORY_TIME = 10.0
+MAX_FRAMES, MAX_STAMPS = 1000, 10_000
 # Maximum deviation of the length of a quaternion from 1, twice that of tf2.
-_NOT_UNIT = 1e-2
+_UNIT_TOLERANCE = 1e-2
 # Cosine of half the angle between two rotations above which interpolation is linear.
-_CLOSE = 0.9995
+_CLOSE_COSINE = 0.9995
 # Maximum number of names of frames in an error.
-_LISTED = 12
+_MAX_LISTED_FRAMES = 12
 
 
 class TransformError(ValueError):
@@ -97,15 +97,15 @@ class _Frame:
 
     def put(self, stamp: int, sample: _Sample) -> None:
         aside, self._aside = self._aside, None
-        if self.places and abs(stamp - self.places[-1][0]) > REMEMBERED * SECOND_NS:
-            if aside is None or not 0 < stamp - aside[0] <= REMEMBERED * SECOND_NS:
+        if self.places and abs(stamp - self.places[-1][0]) > MEMORY_TIME * SECOND_NS:
+            if aside is None or not 0 < stamp - aside[0] <= MEMORY_TIME * SECOND_NS:
                 self._aside = stamp, sample
                 return
             # Time has jumped.
             self.places = [aside]
         self.places[self.first(stamp) : self.first(stamp + 1)] = [(stamp, sample)]
-        old = self.first(self.places[-1][0] - round(REMEMBERED * SECOND_NS))
-        del self.places[: max(old, len(self.places) - MOST_STAMPS)]
+        old = self.first(self.places[-1][0] - round(MEMORY_TIME * SECOND_NS))
+        del self.places[: max(old, len(self.places) - MAX_STAMPS)]
 
     def at(self, stamp: int) -> _Sample | None:
         """Return the place at a time; None outside of the range of known stamps."""
@@ -167,7 +167,7 @@ class TransformBuffer:
 
         A much later place does not count, because its stamp may be wrong.
         """
-        longest = timeout_ns + REMEMBERED * SECOND_NS
+        longest = timeout_ns + MEMORY_TIME * SECOND_NS
         return any(
             timeout_ns < frame.places[-1][0] - stamp_ns <= longest
             for frame in self._frames.values()
@@ -211,11 +211,11 @@ class TransformBuffer:
         if not (np.isfinite(position).all() and np.isfinite(quaternion).all()):
             raise ValueError('its numbers are not finite')
         length = math.hypot(*quaternion)
-        if abs(length - 1.0) > _NOT_UNIT:
+        if abs(length - 1.0) > _UNIT_TOLERANCE:
             raise ValueError(f'its quaternion has length {length:.3g}, wanted 1')
         known = self._frames.get(child)
-        if known is None and len(self._frames) >= MOST_FRAMES:
-            raise ValueError(f'there are {MOST_FRAMES} frames already')
+        if known is None and len(self._frames) >= MAX_FRAMES:
+            raise ValueError(f'there are {MAX_FRAMES} frames already')
         sample = _Sample(parent, position, quaternion / length)
         if static:
             self._frames[child] = _Frame(sample)
@@ -260,7 +260,7 @@ def slerp(start: Array, end: Array, share: float) -> Array:
     cosine = float(product(start, end))
     if cosine < 0:
         end, cosine = -end, -cosine
-    if cosine > _CLOSE:
+    if cosine > _CLOSE_COSINE:
         between = start + share * (end - start)
     else:
         angle = elementary.arccos(cosine)
@@ -275,5 +275,5 @@ def _name(frame: Any) -> str:
 
 def _listed(names: Iterable[str]) -> str:
     every = [one_line(name) for name in names]
-    more = f' and {len(every) - _LISTED} more' if len(every) > _LISTED else ''
-    return (', '.join(every[:_LISTED]) or 'none') + more
+    more = f' and {len(every) - _MAX_LISTED_FRAMES} more' if len(every) > _MAX_LISTED_FRAMES else ''
+    return (', '.join(every[:_MAX_LISTED_FRAMES]) or 'none') + more

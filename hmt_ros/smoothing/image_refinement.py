@@ -29,7 +29,7 @@ from hmt_ros.smoothing.trajectory_refinement import refine
 from hmt_ros.smoothing.variational_mixture import minimise_free_energy
 
 # Maximum number of refined motions, and minimum weight of a refined motion.
-MOST, LEAST = 4, 0.01
+MAX_MOTIONS, MIN_WEIGHT = 4, 0.01
 # Maximum number of steps of a descent, and gain of a step below which it ends, nats.
 STEPS, TOLERANCE = 30, 0.01
 # Number of samples per optimum, and of iterations, of the descent of the free energy.
@@ -62,13 +62,15 @@ def refined_on_images(
     if images.times != motions.times:
         raise ValueError(f'{images.times} images for {motions.times} times')
     d = motions.dimension
-    chosen = _first_of_each(smoother, motions, motions.states, motions.weights, LEAST)[0]
+    chosen = _first_of_each(smoother, motions, motions.states, motions.weights, MIN_WEIGHT)[0]
     intervals = np.diff(motions.stamps_ns) / SECOND_NS
-    prior = smoother.dynamics.prior(intervals, noise=found.liveliness[chosen].max())
+    prior = smoother.dynamics.prior(intervals, noise=found.noise_factor[chosen].max())
     if smoother.resting is not None and len(intervals):
         first = chosen[0]
         covariances = found.evidence.covariances[first]
-        prior = smoother.resting.held(prior, motions.means[first], covariances, intervals)
+        prior = smoother.resting.constrained_prior(
+            prior, motions.means[first], covariances, intervals
+        )
     optima = refine(
         motions.states[chosen],
         prior,
@@ -138,5 +140,5 @@ def _first_of_each(
     points = smoother.points_of(states[:, :, : motions.dimension]).swapaxes(0, 1)
     nodes = np.broadcast_to(np.arange(len(states))[:, None], states.shape[:2])
     distances = path_distances(nodes, list(points), motions.stamps_ns)
-    labels = grouped(weights, *distances, MOST, least)
+    labels = grouped(weights, *distances, MAX_MOTIONS, least)
     return np.unique(labels, return_index=True)[1], labels

@@ -20,7 +20,7 @@ from hmt_ros.smoothing.mode_sequence import ModeSequence, TrajectoryGaussians, p
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import limits_of_states, refine
 from hmt_ros.smoothing.variational_mixture import (
-    ADAPTABLE,
+    ADAPTED_PARAMETERS,
     VariationalMixture,
     laplace_masses,
     minimise_free_energy,
@@ -29,11 +29,11 @@ from hmt_ros.smoothing.variational_mixture import (
 # Maximum number of noise values in the descent of the free energy, which limits the samples.
 SAMPLE_BUDGET = 400_000
 # Minimum weight of a component in the descent, relative to the heaviest one.
-LEAST_SHARE = 1e-6
+MIN_RELATIVE_WEIGHT = 1e-6
 # Minimum number of images for which the parts of paths that differ from the best path are refined
 # first, and margin of such a part on either side, images.
-LONG = 100
-MARGIN = 8
+LONG_WINDOW = 100
+PART_MARGIN = 8
 # Distance from an optimum below which the Gaussian of a path is redundant, standard deviations.
 SAME_DISTANCE = 0.3
 # Distances below which modes are merged to get alternatives to the optima, standard deviations.
@@ -48,7 +48,8 @@ class MixtureSmoother:
         dynamics: dynamics of the state.
         lower, upper: (d,) limits of the pose at every time; None: no limits.
         max_trajectories: maximum number of components of the result.
-        adapt: variables of the descent of the free energy, some of `ADAPTABLE`; empty: no descent.
+        adapt: variables of the descent of the free energy, some of `ADAPTED_PARAMETERS`; empty: no
+            descent.
         max_iterations: maximum number of iterations of the descent of the free energy.
 
     Raises:
@@ -59,15 +60,15 @@ class MixtureSmoother:
     lower: ArrayLike | None = None
     upper: ArrayLike | None = None
     max_trajectories: int = 64
-    adapt: Sequence[str] = ADAPTABLE
+    adapt: Sequence[str] = ADAPTED_PARAMETERS
     max_iterations: int = 15
 
     def __post_init__(self) -> None:
         if self.max_trajectories < 1:
             raise ValueError(f'max_trajectories must be at least 1, saw {self.max_trajectories}')
-        wrong = [name for name in self.adapt if name not in ADAPTABLE]
+        wrong = [name for name in self.adapt if name not in ADAPTED_PARAMETERS]
         if wrong:
-            raise ValueError(f'adapt: no {wrong[0]!r}, wanted some of {ADAPTABLE}')
+            raise ValueError(f'adapt: no {wrong[0]!r}, wanted some of {ADAPTED_PARAMETERS}')
         self._limits()
 
     def smooth(
@@ -135,7 +136,7 @@ class MixtureSmoother:
         best = refine(starts[:1], prior, likelihood, low[:d], high[:d])
         shared = paths.nodes == paths.nodes[0]
         starts = np.where(shared[:, :, None], best.states, starts)
-        if starts.shape[1] >= LONG:
+        if starts.shape[1] >= LONG_WINDOW:
             starts = with_refined_parts(starts, shared, prior, likelihood, low[:d], high[:d])
         refined = refine(starts, prior, likelihood, low[:d], high[:d])
         refined = refined.without_duplicates()
@@ -192,7 +193,7 @@ class MixtureSmoother:
         """Optimise the heavy components, and leave the others unchanged."""
         low, high = self._limits()
         weights, means = candidates.weights, candidates.states.copy()
-        heavy = weights > LEAST_SHARE * weights.max()
+        heavy = weights > MIN_RELATIVE_WEIGHT * weights.max()
         states = means[heavy]
         samples = int(np.clip(SAMPLE_BUDGET // states.size // 2 * 2, 4, 32))
         found = minimise_free_energy(
@@ -306,9 +307,9 @@ def with_refined_parts(
     times = starts.shape[1]
     parts: dict[tuple[int, int], list[int]] = {}
     for i, same in enumerate(shared):
-        apart = np.lib.stride_tricks.sliding_window_view(np.pad(~same, MARGIN), 2 * MARGIN + 1).any(
-            1
-        )
+        apart = np.lib.stride_tricks.sliding_window_view(
+            np.pad(~same, PART_MARGIN), 2 * PART_MARGIN + 1
+        ).any(1)
         edges = np.flatnonzero(np.diff(apart, prepend=False, append=False))
         for first, last in zip(edges[::2], edges[1::2]):
             if last - first <= times // 2:

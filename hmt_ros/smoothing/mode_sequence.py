@@ -42,7 +42,7 @@ from hmt_ros.smoothing.embedded_network import (
 from hmt_ros.smoothing.likelihood import MixtureLikelihood
 
 # Number of candidate paths per selected path.
-CANDIDATES = 4
+CANDIDATES_PER_PATH = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class ModeSequence:
         these are too few.
         """
         pairs = len(self.network.nodes[0]) * len(self.network.nodes[-1])
-        per_pair = 1 if pairs >= count else -(-CANDIDATES * count // pairs)
+        per_pair = 1 if pairs >= count else -(-CANDIDATES_PER_PATH * count // pairs)
         return diverse_subset(k_best_paths(self.network, per_pair), count)
 
     def states(self, paths: Paths) -> Array:

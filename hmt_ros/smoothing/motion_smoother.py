@@ -25,7 +25,7 @@ from hmt_ros.core import condition_chain
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.block_tridiagonal import BlockCholesky, NotPositiveDefiniteError
-from hmt_ros.inference.error_model import TOGETHER, CueErrors
+from hmt_ros.inference.error_model import JOINT_COVARIANCE_RATIO, CueErrors
 from hmt_ros.inference.linear_algebra import (
     inverse,
     log_determinant,
@@ -36,7 +36,7 @@ from hmt_ros.inference.linear_algebra import (
 from hmt_ros.inference.linear_gaussian_dynamics import Couplings, LinearGaussianDynamics
 from hmt_ros.inference.mode_chain import Link, backward_weights, drawn_paths
 from hmt_ros.smoothing.motions import (
-    SAME_MOTION,
+    SAME_MOTION_DISTANCE,
     SECOND_NS,
     MotionEvidence,
     evidence_of_motions,
@@ -47,16 +47,16 @@ from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import limits_of_states
 
 # Number of paths drawn from the chain.
-PATHS = 96
+PATH_SAMPLES = 96
 # Values of l, and the median distance from the modes above which the next value is tried, m.
-LIVELIER, ASTRAY = (1.0, 4.0, 16.0, 64.0), 0.05
+NOISE_FACTORS, MAX_MEDIAN_DISTANCE = (1.0, 4.0, 16.0, 64.0), 0.05
 # Distance of an image's modes from the states above which the image is an outlier, m, and maximum
 # number of passes that reduce the weights of outliers.
-WRONG, WRONG_PASSES = 0.15, 3
+WRONG_DISTANCE, MAX_WRONG_PASSES = 0.15, 3
 # Distance from all motions above which a mode is a stray, m.
-STRAY = 0.05
+STRAY_DISTANCE = 0.05
 # Minimum weight of a motion over several images, and of a motion whose resting points are fixed.
-LEAST, LEAST_HELD = 0.03, 0.1
+MIN_WEIGHT, MIN_RESTING_WEIGHT = 0.03, 0.1
 
 
 class ImageModes(NamedTuple):
@@ -82,14 +82,14 @@ class WindowImage(NamedTuple):
         modes: the modes of the image.
         counted: the likelihood, with covariances that account for persistent errors.
         points: (K, P, 3) points of the modes, m.
-        lasting: factor on the posterior variance, because the image's errors persist.
+        persistence_ratio: factor on the posterior variance, because the image's errors persist.
         alone: factor on the covariances of modes that belong to no motion.
     """
 
     modes: ImageModes
     counted: GaussianMixture
     points: Array
-    lasting: float
+    persistence_ratio: float
     alone: float
 
 
@@ -98,12 +98,12 @@ class FirstStates(NamedTuple):
 
     Attributes:
         means, covariances: (M, n) and (M, n, n) moments of the states.
-        liveliness: (M,) noise factor l of each motion's predecessor.
+        noise_factor: (M,) noise factor l of each motion's predecessor.
     """
 
     means: Array
     covariances: Array
-    liveliness: Array
+    noise_factor: Array
 
 
 class Past(NamedTuple):
@@ -146,16 +146,16 @@ class MotionStates(NamedTuple):
         states: (T, n) smoothed states.
         factor: Cholesky factor of the precision of the states.
         log_joint: log p(X, R), with Gaussian image likelihoods.
-        liveliness: noise factor l.
-        trust: (T,) factor on the precision of each image.
+        noise_factor: noise factor l.
+        precision_factors: (T,) factor on the precision of each image.
         fresh: whether the motion ignores the past.
     """
 
     states: Array
     factor: BlockCholesky
     log_joint: float
-    liveliness: float
-    trust: Array
+    noise_factor: float
+    precision_factors: Array
     fresh: bool
 
 
@@ -166,7 +166,7 @@ class SmoothedMotions(NamedTuple):
         trajectories: the M trajectories.
         shares: T arrays (K_t, M), probabilities that each mode belongs to each motion.
         evidence: evidence of the images; outlier images have larger covariances.
-        liveliness: (M,) noise factor l.
+        noise_factor: (M,) noise factor l.
         fresh: (M,) whether a motion ignores the past.
         first: prediction from the past; None: no past.
     """
@@ -174,7 +174,7 @@ class SmoothedMotions(NamedTuple):
     trajectories: TrajectoryMixture
     shares: list[Array]
     evidence: MotionEvidence
-    liveliness: Array
+    noise_factor: Array
     fresh: Mask
     first: FirstStates | None
 
@@ -248,8 +248,8 @@ class MotionSmoother:
         dt = np.inf if before_ns is None else (modes.stamp_ns - before_ns) / SECOND_NS
         counted = replace(mixture, covariances=mixture.covariances / modes.errors.of_changes(dt))
         points = self.points_of(mixture.means)
-        alone = TOGETHER / modes.errors.share(dt)
-        return WindowImage(modes, counted, points, modes.errors.lasting(dt), alone)
+        alone = JOINT_COVARIANCE_RATIO / modes.errors.share(dt)
+        return WindowImage(modes, counted, points, modes.errors.persistence_ratio(dt), alone)
 
     def smooth(self, sequence: Sequence[ImageModes]) -> TrajectoryMixture:
         """The trajectories of a whole sequence; see `motions`."""
@@ -271,11 +271,11 @@ class MotionSmoother:
         """The motions of the images of a window."""
         stamps = [image.modes.stamp_ns for image in images]
         links = [image.modes.link for image in images]
-        nodes, weights = drawn_paths(links, PATHS, self.seed)
+        nodes, weights = drawn_paths(links, PATH_SAMPLES, self.seed)
         points = [image.points for image in images]
         before = None if past is None else past.places[past.shares[nodes[:, 0]].argmax(1)]
         distances = path_distances(nodes, points, stamps, before)
-        least = LEAST if len(images) > 1 else 0.0
+        least = MIN_WEIGHT if len(images) > 1 else 0.0
         labels = grouped(weights, *distances, self.max_motions, least)
         counted = [image.counted for image in images]
         known = None if self.points is None else points
@@ -289,11 +289,13 @@ class MotionSmoother:
         intervals = np.diff(stamps) / SECOND_NS
         couplings = self.dynamics.couplings(intervals)
         found = [
-            self._states(intervals, couplings, evidence, first, m, masses[m] >= LEAST_HELD)
+            self._states(intervals, couplings, evidence, first, m, masses[m] >= MIN_RESTING_WEIGHT)
             for m in range(len(masses))
         ]
-        trust = np.array([one.trust for one in found])
-        evidence = evidence._replace(covariances=evidence.covariances / trust[:, :, None, None])
+        precision_factors = np.array([one.precision_factors for one in found])
+        evidence = evidence._replace(
+            covariances=evidence.covariances / precision_factors[:, :, None, None]
+        )
         low, high = self.limits()
         d = self.dynamics.dimension
         states = np.clip([one.states for one in found], low, high)
@@ -301,7 +303,9 @@ class MotionSmoother:
             weights=masses / masses.sum(),
             states=states,
             factors=tuple(one.factor for one in found),
-            inflation=np.full(len(masses), np.sqrt(np.mean([image.lasting for image in images]))),
+            inflation=np.full(
+                len(masses), np.sqrt(np.mean([image.persistence_ratio for image in images]))
+            ),
             log_joint=np.array([one.log_joint for one in found]),
             free_energy=np.empty(0),
             dimension=d,
@@ -312,9 +316,9 @@ class MotionSmoother:
         )
         if self.points is not None:
             trajectories = self._with_weights_in_time(trajectories, images, shares)
-        liveliness = np.array([one.liveliness for one in found])
+        noise_factor = np.array([one.noise_factor for one in found])
         fresh = np.array([one.fresh for one in found])
-        return SmoothedMotions(trajectories, shares, evidence, liveliness, fresh, first)
+        return SmoothedMotions(trajectories, shares, evidence, noise_factor, fresh, first)
 
     def _with_weights_in_time(
         self, found: TrajectoryMixture, images: Sequence[WindowImage], shares: Sequence[Array]
@@ -326,8 +330,10 @@ class MotionSmoother:
         for t, (image, own, places) in enumerate(zip(images, smoothed, every, strict=True)):
             away = mean_distances(image.points[:, None], places)
             nearest = away.min(1, keepdims=True)
-            parts = np.where(away <= nearest + SAME_MOTION / 2, shares[t] + 1e-6 * found.weights, 0)
-            stray = nearest[:, 0] > STRAY
+            parts = np.where(
+                away <= nearest + SAME_MOTION_DISTANCE / 2, shares[t] + 1e-6 * found.weights, 0
+            )
+            stray = nearest[:, 0] > STRAY_DISTANCE
             parts *= np.where(stray, 0.0, own / parts.sum(1))[:, None]
             weights[t], alone = parts.sum(0), np.flatnonzero(stray & (own > 0.0))
             modes = image.modes.mixture[alone]
@@ -343,7 +349,7 @@ class MotionSmoother:
         offsets = past.first.means - means[:, None]
         covariances = np.einsum('mk,kij->mij', shares, past.first.covariances)
         covariances += product((offsets * shares[:, :, None]).swapaxes(1, 2), offsets)
-        return FirstStates(means, covariances, past.first.liveliness[shares.argmax(1)])
+        return FirstStates(means, covariances, past.first.noise_factor[shares.argmax(1)])
 
     def _states(
         self,
@@ -357,32 +363,34 @@ class MotionSmoother:
         """Compute the states of motion m; `held` fixes its resting points."""
         dynamics, d = self.dynamics, self.dynamics.dimension
         means, precisions = evidence.means[m], inverse(evidence.covariances[m])
-        places, trust = self.points_of(means), np.ones(len(means))
-        at, known, least = dynamics.initial_mean, dynamics.initial_precision, LIVELIER[0]
+        places, precision_factors = self.points_of(means), np.ones(len(means))
+        at, known, least = dynamics.initial_mean, dynamics.initial_precision, NOISE_FACTORS[0]
         fresh = first is None
         if first is not None and self.points is not None:
             before = self.points_of(first.means[m, :d])
-            fresh = bool(mean_distances(before, places).min() > WRONG)
+            fresh = bool(mean_distances(before, places).min() > WRONG_DISTANCE)
         if first is not None and not fresh:
             at, known = first.means[m], inverse(first.covariances[m])
-            least = first.liveliness[m] / LIVELIER[1]
+            least = first.noise_factor[m] / NOISE_FACTORS[1]
         known = 0.5 * (known + known.T)
         pull_of_first = product(known, at)
-        for liveliness in (x for x in LIVELIER if x >= least):
-            noise = np.full(len(intervals), liveliness)
+        for noise_factor in (x for x in NOISE_FACTORS if x >= least):
+            noise = np.full(len(intervals), noise_factor)
             prior = ChainPrior(*couplings[:4], 1.0 / noise, known, pull_of_first)
             states, factor = _conditioned(prior, precisions, means)
             away = self._away(states, places)
-            if self.points is None or np.median(away) <= ASTRAY:
+            if self.points is None or np.median(away) <= MAX_MEDIAN_DISTANCE:
                 break
-        for _ in range(WRONG_PASSES):
-            wrong = away > WRONG
+        for _ in range(MAX_WRONG_PASSES):
+            wrong = away > WRONG_DISTANCE
             if self.points is None or not wrong.any():
                 break
-            trust = np.where(wrong, (ASTRAY / away) ** 2, 1.0)
-            states, factor = _conditioned(prior, precisions * trust[:, None, None], means)
+            precision_factors = np.where(wrong, (MAX_MEDIAN_DISTANCE / away) ** 2, 1.0)
+            states, factor = _conditioned(
+                prior, precisions * precision_factors[:, None, None], means
+            )
             away = self._away(states, places)
-        precisions = precisions * trust[:, None, None]
+        precisions = precisions * precision_factors[:, None, None]
         pull = product(precisions, means[:, :, None])[:, :, 0]
         seen = 0.5 * ((means * pull).sum() - log_determinant(precisions).sum())
         seen += 0.5 * product(at, pull_of_first) + couplings.constant(noise)
@@ -393,14 +401,16 @@ class MotionSmoother:
             resting = self.resting.along(poses, evidence.covariances[m], intervals)
             if resting is not None:
                 states = _conditioned(prior, precisions, means, resting)[0]
-        return MotionStates(states, factor, float(gained - seen), liveliness, trust, fresh)
+        return MotionStates(
+            states, factor, float(gained - seen), noise_factor, precision_factors, fresh
+        )
 
     def _away(self, states: Array, places: Array) -> Array:
         """Mean distances (T,) between the points of states (T, n) and points (T, P, 3), m."""
         poses = np.clip(states, *self.limits())[:, : self.dynamics.dimension]
         return np.asarray(mean_distances(self.points_of(poses), places))
 
-    def advanced(self, found: SmoothedMotions, count: int, after: ImageModes) -> Past:
+    def past_after(self, found: SmoothedMotions, count: int, after: ImageModes) -> Past:
         """Predict the image that follows the images which leave a window.
 
         Args:
@@ -430,8 +440,8 @@ class MotionSmoother:
                 covariances[found.fresh] = dynamics.states(spread[found.fresh])
             interval = (times[t + 1] - times[t]) / SECOND_NS
             means, covariances = dynamics.predict(means, covariances, interval)
-            livelier = found.liveliness[:, None, None] - 1.0
-            covariances = covariances + livelier * dynamics.transition(interval)[1]
+            extra_noise = found.noise_factor[:, None, None] - 1.0
+            covariances = covariances + extra_noise * dynamics.transition(interval)[1]
             covariances = 0.5 * (covariances + covariances.swapaxes(1, 2))
         shares = (
             found.shares[count]
@@ -439,7 +449,7 @@ class MotionSmoother:
             else product(after.link.origins, found.shares[-1])
         )
         places = self.points_of(found.trajectories.means[:, count - 1])
-        return Past(shares, FirstStates(means, covariances, found.liveliness), places)
+        return Past(shares, FirstStates(means, covariances, found.noise_factor), places)
 
 
 def _shares(nodes: Index, weights: Array, labels: Index, count: int, masses: Array) -> Array:

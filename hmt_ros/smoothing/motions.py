@@ -29,11 +29,11 @@ from hmt_ros.inference.linear_algebra import distances, mean_distances, product
 
 SECOND_NS = 10**9
 # Distance below which two paths are one motion, and limit c of the distance in a span, m.
-SAME_MOTION, MOST_APART = 0.03, 0.09
+SAME_MOTION_DISTANCE, MAX_SPAN_DISTANCE = 0.03, 0.09
 # Distance above which two modes of an image are not merged, m.
-OPPOSITE = 0.1
+OPPOSITE_DISTANCE = 0.1
 # Length of a span, s, and number of spans of a moment.
-SPAN, MOMENT = 1.0 / 6.0, 3
+SPAN_TIME, SPANS_PER_MOMENT = 1.0 / 6.0, 3
 
 
 class MotionEvidence(NamedTuple):
@@ -62,7 +62,7 @@ def path_distances(
         before: (N, P, 3) points of each path in the span before the first, m; None: unknown.
     """
     ages = (stamps[-1] - np.asarray(stamps, dtype=np.int64)) / SECOND_NS
-    spans = np.floor(ages / SPAN + 1e-3).astype(np.intp)
+    spans = np.floor(ages / SPAN_TIME + 1e-3).astype(np.intp)
     apart = {
         span: _apart([points[t][nodes[:, t]] for t in np.flatnonzero(spans == span).tolist()])
         for span in np.unique(spans).tolist()
@@ -71,11 +71,15 @@ def path_distances(
         apart[max(apart) + 1] = _apart([before])
     known = np.array([*apart])
     # Oldest span of each moment; moments with the same images count once.
-    ends = np.unique([known, known + MOMENT - 1]).clip(MOMENT - 1).clip(max=known.max())
+    ends = (
+        np.unique([known, known + SPANS_PER_MOMENT - 1])
+        .clip(SPANS_PER_MOMENT - 1)
+        .clip(max=known.max())
+    )
     most = np.zeros((len(nodes), len(nodes)))
     for end in np.unique(ends):
-        moment = [apart[span] for span in known.tolist() if end - MOMENT < span <= end]
-        np.maximum(most, np.minimum(moment, MOST_APART).mean(0), out=most)
+        moment = [apart[span] for span in known.tolist() if end - SPANS_PER_MOMENT < span <= end]
+        np.maximum(most, np.minimum(moment, MAX_SPAN_DISTANCE).mean(0), out=most)
     return most, np.mean([*apart.values()], axis=0)
 
 
@@ -90,7 +94,8 @@ def grouped(weights: Array, distances: Array, means: Array, most: int, least: fl
     """Return the motion (N,) of each path, numbered by weight.
 
     Motions are found one by one: the path with the largest total weight of paths within
-    `SAME_MOTION` is the next leader. Every path belongs to the leader at the least mean distance.
+    `SAME_MOTION_DISTANCE` is the next leader. Every path belongs to the leader at the least mean
+    distance.
 
     Args:
         weights: (N,) weights of the paths, with sum 1.
@@ -98,7 +103,7 @@ def grouped(weights: Array, distances: Array, means: Array, most: int, least: fl
         most: maximum number of motions.
         least: minimum weight of a motion; paths of lighter motions are given to the others.
     """
-    near, left, leaders = distances <= SAME_MOTION, weights.copy(), list[int]()
+    near, left, leaders = distances <= SAME_MOTION_DISTANCE, weights.copy(), list[int]()
     while len(leaders) < most and left.any():
         leaders.append(int(np.argmax(product(near, left))))
         left[near[leaders[-1]]] = 0.0
@@ -136,7 +141,7 @@ def evidence_of_motions(
         np.add.at(shares, (labels, nodes[:, t]), weights)
         if points is not None:
             heaviest = points[t][shares.argmax(1), None]
-            shares[mean_distances(heaviest, points[t]) > OPPOSITE] = 0.0
+            shares[mean_distances(heaviest, points[t]) > OPPOSITE_DISTANCE] = 0.0
         shares /= shares.sum(1, keepdims=True)
         means[:, t] = product(shares, mixture.means)
         offsets = mixture.means - means[:, t, None]

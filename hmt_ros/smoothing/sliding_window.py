@@ -26,11 +26,11 @@ from hmt_ros.smoothing.motion_smoother import (
     SmoothedMotions,
     WindowImage,
 )
-from hmt_ros.smoothing.motions import SAME_MOTION, SECOND_NS
+from hmt_ros.smoothing.motions import SAME_MOTION_DISTANCE, SECOND_NS
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 
 # Relative variation of the intervals between poses.
-TREMBLE = 0.1
+INTERVAL_JITTER = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +150,7 @@ class SlidingWindow:
                 f'origins have shape {modes.link.origins.shape}, wanted a column for each of '
                 f'{before} modes of the image before'
             )
-        self._leave_behind(image)
+        self._drop_final_images(image)
         self._images.append(image)
         if not self._is_due((stamp - stamps[-1]) / SECOND_NS if stamps else 0.0):
             return WindowUpdate(None, ())
@@ -161,12 +161,12 @@ class SlidingWindow:
         self._last = found
         return WindowUpdate(found, _final_poses(found, range(self._final)))
 
-    def _leave_behind(self, newest: WindowImage) -> None:
+    def _drop_final_images(self, newest: WindowImage) -> None:
         """Remove final images from the window before the newest one is added."""
         if self._final:
             assert self._found is not None
             after = [*self._images, newest][self._final].modes
-            self._past = self.smoother.advanced(self._found, self._final, after)
+            self._past = self.smoother.past_after(self._found, self._final, after)
             del self._images[: self._final]
             self._final = 0
 
@@ -175,7 +175,7 @@ class SlidingWindow:
         if self._last is None or self._last.stamps_ns is None:
             return True
         since = (self.stamps_ns[-1] - self._last.stamps_ns[-1]) / SECOND_NS
-        return since >= self.every - TREMBLE * interval
+        return since >= self.every - INTERVAL_JITTER * interval
 
     def _number_of_final(self) -> int:
         """Return the number of final poses, which are the oldest of the window."""
@@ -189,7 +189,7 @@ class SlidingWindow:
             return 0
         # Poses that would be too old at the next image; the margin allows for jitter of stamps.
         interval = stamps[-1] - stamps[-2]
-        until = stamps[-1] + interval - lag - round(TREMBLE * interval)
+        until = stamps[-1] + interval - lag - round(INTERVAL_JITTER * interval)
         return sum(stamp < until for stamp in stamps[:-1])
 
     def finish(self) -> tuple[FinalPose, ...]:
@@ -213,9 +213,9 @@ class SlidingWindow:
     def _identities(self, found: TrajectoryMixture) -> tuple[int, ...]:
         """Return identities of trajectories, inherited from predecessors, heaviest first.
 
-        The predecessor is a trajectory of the last smoothing that is closer than `SAME_MOTION` and
-        has no heavier successor; of several, the one with the least distance divided by its weight.
-        A trajectory without predecessor gets a new identity.
+        The predecessor is a trajectory of the last smoothing that is closer than
+        `SAME_MOTION_DISTANCE` and has no heavier successor; of several, the one with the least
+        distance divided by its weight. A trajectory without predecessor gets a new identity.
         """
         numbers = np.zeros(len(found), dtype=np.int64)
         away, before = self._distances(found)
@@ -233,7 +233,7 @@ class SlidingWindow:
         """Return distances (M, L) from the last L trajectories, and their identities.
 
         A distance is the mean over the points and the common times, divided by the weight of the
-        last trajectory, and infinite beyond `SAME_MOTION`.
+        last trajectory, and infinite beyond `SAME_MOTION_DISTANCE`.
         """
         last = self._last
         common = 0 if last is None else len({*self.stamps_ns} & {*(last.stamps_ns or ())})
@@ -244,7 +244,7 @@ class SlidingWindow:
             for means in (found.means[:, :common], last.means[:, -common:])
         )
         away = mean_distances(now[:, None], before).mean(2)
-        return np.where(away <= SAME_MOTION, away / last.weights, np.inf), last.identities
+        return np.where(away <= SAME_MOTION_DISTANCE, away / last.weights, np.inf), last.identities
 
 
 def _final_poses(found: TrajectoryMixture, indices: Sequence[int]) -> tuple[FinalPose, ...]:

@@ -132,7 +132,8 @@ class TrajectoryMixture:
         """The density of the pose at index t: a component for each trajectory, and the strays.
 
         If trajectories are motions, the heaviest motion has the largest weight at every time; see
-        `led_by_first`. If another motion were heavier in a single image, estimates would flicker.
+        `weights_capped_by_first`. If another motion were heavier in a single image, estimates would
+        flicker.
         """
         covariances = np.array([self.covariances_of(i, t + 1)[t] for i in range(len(self))])
         weights = self.weights if self.weights_in_time is None else self.weights_in_time[t]
@@ -141,7 +142,7 @@ class TrajectoryMixture:
             poses = joined(poses, self.strays[t])
         if self.weights_in_time is None:
             return poses
-        return replace(poses, weights=led_by_first(poses.weights))
+        return replace(poses, weights=weights_capped_by_first(poses.weights))
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """Draws trajectories (n, T, d), projected onto the limits."""
@@ -230,7 +231,7 @@ def joined(one: GaussianMixture, other: GaussianMixture) -> GaussianMixture:
     )
 
 
-def led_by_first(weights: Array) -> Array:
+def weights_capped_by_first(weights: Array) -> Array:
     """Lower weights (K,) that exceed the first one, without changing their sum.
 
     The other weights are cut at a level. Their excess raises the first weight to this level.

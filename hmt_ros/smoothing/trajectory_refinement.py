@@ -34,7 +34,7 @@ from hmt_ros.smoothing.likelihood import SequenceLikelihood
 FIRST_DAMPING = 1e-4
 DAMPING_LIMIT = 1e10
 # Shares of the positive Hessian in a step where the exact Hessian is indefinite.
-SHARES = (0.125, 0.25, 0.5, 0.75)
+HESSIAN_SHARES = (0.125, 0.25, 0.5, 0.75)
 # Maximum number of doubles in the observation Hessians in memory.
 HESSIAN_BUDGET = 800_000
 
@@ -261,7 +261,7 @@ class _Problem:
                         held[row],
                         step[row],
                     )
-                    for share in SHARES
+                    for share in HESSIAN_SHARES
                 ):
                     continue
                 self.exact[i] = False

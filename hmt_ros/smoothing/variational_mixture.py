@@ -47,16 +47,16 @@ from hmt_ros.inference.random_numbers import standard_normals
 from hmt_ros.inference.threads import together
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
-ADAPTABLE = ('weights', 'means', 'inflation')
+ADAPTED_PARAMETERS = ('weights', 'means', 'inflation')
 # Number of parts into which components are split; fixed, so that sums keep their order.
-PARTS = 4
+PART_COUNT = 4
 # Maximum number of successive iterations without a gain on held-out samples.
-PATIENCE = 3
-MEMORY = 8  # number of past steps in L-BFGS
+MAX_IDLE_ITERATIONS = 3
+HISTORY_LENGTH = 8  # number of past steps in L-BFGS
 # Minimum proportion for the scale of a component's variables.
-LEAST_WEIGHT = 1e-4
+MIN_WEIGHT = 1e-4
 # Minus the logarithm of a negligible overlap.
-NEGLIGIBLE = 30.0
+NEGLIGIBLE_OVERLAP = 30.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ def minimise_free_energy(
     prior: TrajectoryPrior,
     likelihood: SequenceLikelihood,
     *,
-    adapt: Sequence[str] = ADAPTABLE,
+    adapt: Sequence[str] = ADAPTED_PARAMETERS,
     low: Array | float = -np.inf,
     high: Array | float = np.inf,
     samples: int = 8,
@@ -109,7 +109,7 @@ def minimise_free_energy(
     Args:
         weights: (M,) proportions.
         states: (M, T, n) means.
-        adapt: names of the adapted variables, some of `ADAPTABLE`.
+        adapt: names of the adapted variables, some of `ADAPTED_PARAMETERS`.
         low, high: (n,) limits of the means.
         samples: number of samples per component, even.
         max_iterations: maximum number of L-BFGS iterations; 0 evaluates only.
@@ -178,7 +178,7 @@ def _descend(
     iterates = descent(
         lambda x: objective(x) if x.any() else first,
         start,
-        memory=MEMORY,
+        memory=HISTORY_LENGTH,
         most_evaluations=3 * max_iterations,
     )
     for x, value in islice(iterates, max_iterations):
@@ -189,7 +189,10 @@ def _descend(
         held_out.append(_free_energy(objective, x, choice))
         if held_out[-1] < min(held_out[:-1]):
             best = x
-        if gained < tolerance or len(held_out) - 1 - int(np.argmin(held_out)) >= PATIENCE:
+        if (
+            gained < tolerance
+            or len(held_out) - 1 - int(np.argmin(held_out)) >= MAX_IDLE_ITERATIONS
+        ):
             break
     return best, np.array(trace[: int(np.argmin(held_out)) + 1]), np.array(held_out)
 
@@ -227,7 +230,7 @@ class FreeEnergy:
         self.factors = list(factors)
         self.low = np.tile(np.broadcast_to(low, (self.size,)), self.times)
         self.high = np.tile(np.broadcast_to(high, (self.size,)), self.times)
-        self.scale = np.sqrt(np.maximum(weights, LEAST_WEIGHT))
+        self.scale = np.sqrt(np.maximum(weights, MIN_WEIGHT))
         self.spread = self.scale * np.sqrt(2.0 * self.total)
         sizes = {
             'weights': self.count,
@@ -305,8 +308,10 @@ class FreeEnergy:
         near, farthest = self._near(means, inflation)
         each = np.empty((count, samples))
         slope = np.empty((count, samples, total))
-        edges = np.linspace(0, count, PARTS + 1).astype(int)
-        sums = [(np.zeros((count, total)), np.zeros(count), np.zeros(count)) for _ in range(PARTS)]
+        edges = np.linspace(0, count, PART_COUNT + 1).astype(int)
+        sums = [
+            (np.zeros((count, total)), np.zeros(count), np.zeros(count)) for _ in range(PART_COUNT)
+        ]
 
         def work(part: int) -> None:
             for i in range(edges[part], edges[part + 1]):
@@ -333,7 +338,7 @@ class FreeEnergy:
                 if derivatives:
                     slope[i] += pull
 
-        together([partial(work, part) for part in range(PARTS)])
+        together([partial(work, part) for part in range(PART_COUNT)])
         return each, slope, tuple(sum(column[1:], start=column[0]) for column in zip(*sums))
 
     def _energy(self, points: Array) -> tuple[Array, Array]:
@@ -370,5 +375,5 @@ class FreeEnergy:
         distances = pair_distances(
             poses, self.marginals.reshape(-1, self.size, self.size), scales, pairs
         )
-        near[i, j] = near[j, i] = 0.25 * distances < NEGLIGIBLE
+        near[i, j] = near[j, i] = 0.25 * distances < NEGLIGIBLE_OVERLAP
         return near, farthest

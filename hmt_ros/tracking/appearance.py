@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import NEAR, Camera
+from hmt_ros.body.camera import MIN_DEPTH, Camera
 from hmt_ros.body.keep_out import RUNNING_SPEED
 from hmt_ros.core import elementary
 from hmt_ros.image.person_colours import LEARNING_INTERVAL, MEMORY_TIME, Colours, Motion
@@ -32,7 +32,7 @@ from hmt_ros.image.person_shape import (
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.error_model import seconds
 from hmt_ros.tracking.observer import View
-from hmt_ros.tracking.settings import MAJORITY, UNDECIDED_FRACTION
+from hmt_ros.tracking.settings import MAJORITY_FRACTION, UNDECIDED_FRACTION
 
 
 class Silhouetted(NamedTuple):
@@ -65,14 +65,14 @@ class Appearance:
         self.colours = Colours()
         self._model: Mask | None = None
         self._depth = self._magnification = math.nan
-        self._share, self._area = MAJORITY, math.nan
+        self._share, self._area = MAJORITY_FRACTION, math.nan
         self._stamp = 0
         self._coloured: int | None = None
         # Foreground of the last image on the raster, and its largest piece shaped like a person.
         self._foreground: Mask | None = None
         self._piece: Piece | None = None
 
-    def open_to_view(self, others: Mask | None) -> float:
+    def uncovered_share(self, others: Mask | None) -> float:
         """Share of the model's last area in the image that other people (H, W) do not cover."""
         if self._model is None or others is None:
             return 1.0
@@ -94,7 +94,7 @@ class Appearance:
         if view.anywhere is None:
             return None
         model = np.zeros_like(view.anywhere) if self._model is None else self._model
-        if view.changed > MAJORITY + counted(model) / model.size:
+        if view.changed > MAJORITY_FRACTION + counted(model) / model.size:
             return None
         foreground, others = view.anywhere, view.others
         if others is not None and view.silhouette is not None:
@@ -107,7 +107,7 @@ class Appearance:
         area = 0.0
         if piece is not None:
             shrunk = (self._depth / (self._depth + RUNNING_SPEED * self.unseen(stamp))) ** 2
-            least = self._area * shrunk * self.open_to_view(others)
+            least = self._area * shrunk * self.uncovered_share(others)
             area = 1.0 if math.isnan(least) else piece.area / least
         return Silhouetted(
             _evidence(place / self._share), _evidence(area), piece is not None and piece.cut
@@ -155,10 +155,10 @@ class Appearance:
         dt = 0.0 if self._model is None else seconds(stamp - self._stamp)
         gain = -float(elementary.expm1(-dt / MEMORY_TIME))
         self._model = model = covered(body, camera, pose, raster_step(camera.height))
-        self._depth, self._stamp = max(float(pose[2]), NEAR), stamp
+        self._depth, self._stamp = max(float(pose[2]), MIN_DEPTH), stamp
         self._magnification = camera.magnification(self._depth) / raster_step(camera.height)
-        free = self.open_to_view(view.others)
-        if free < MAJORITY:
+        free = self.uncovered_share(view.others)
+        if free < MAJORITY_FRACTION:
             return
         if view.others is not None:
             model = model & ~on_raster(view.others, model)

@@ -4,7 +4,7 @@
     subject       a subject file, and an image at or after it       given
     mixture       a given mixture                                   given
     keypoints     most of the trunk, and 6 joints in all            -
-    prediction    poses that a regression predicts                  AT_ONCE
+    prediction    poses that a regression predicts                  PREDICTION_LOG_ODDS
     keypoints     of a part: a person, both shoulders or hips       -
     box           a box around the person                           given
     mask          a mask with the shape of a person                 -
@@ -39,7 +39,7 @@ from hmt_ros.core import elementary
 from hmt_ros.experts.lifted_fit import KNOWN_SIZE, poses_of
 from hmt_ros.experts.lifter import landmark_rays
 from hmt_ros.image.joint_depths import depths_of, moved_to_depth
-from hmt_ros.image.keypoint_evidence import FEWEST_KEYPOINTS, shows_a_part, suffices
+from hmt_ros.image.keypoint_evidence import MIN_KEYPOINTS, shows_a_part, suffices
 from hmt_ros.image.observation import Box, Observation, observe
 from hmt_ros.image.person_shape import looks_like_person
 from hmt_ros.image.sampling import ImageMap
@@ -49,7 +49,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import seconds
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.tracking.existence import CLEAR, Existence
+from hmt_ros.tracking.existence import CLEAR_CUE, Existence
 from hmt_ros.tracking.ground import Gravity
 from hmt_ros.tracking.hypotheses import PosePrediction
 from hmt_ros.tracking.initialisation import (
@@ -60,13 +60,13 @@ from hmt_ros.tracking.initialisation import (
     start_from_keypoints,
 )
 from hmt_ros.tracking.observer import View
-from hmt_ros.tracking.settings import MAX_STARTS, PRESENT_PROBABILITY, SAME_MOMENT
+from hmt_ros.tracking.settings import MAX_STARTS, PRESENT_PROBABILITY, SAME_MOMENT_TIME
 
 # Log odds of existence from a prediction, nats: a first image may have no other evidence.
-AT_ONCE = 1.5 * CLEAR.nats
+PREDICTION_LOG_ODDS = 1.5 * CLEAR_CUE.nats
 PRESENT_LOG_ODDS = float(elementary.log(PRESENT_PROBABILITY / (1.0 - PRESENT_PROBABILITY)))
 # Number of keypoint poses, best first, whose depth reversals become hypotheses too.
-REVERSED = MAX_STARTS // 4
+MAX_REVERSED_POSES = MAX_STARTS // 4
 
 
 class Source(Enum):
@@ -82,8 +82,8 @@ class Source(Enum):
 
 
 # Sources whose best pose is near the person, and sources possibly based on silhouettes alone.
-FROM_JOINTS = (Source.SUBJECT, Source.KEYPOINTS)
-FROM_SILHOUETTES = (Source.PREDICTION, Source.ARRIVAL)
+JOINT_SOURCES = (Source.SUBJECT, Source.KEYPOINTS)
+SILHOUETTE_SOURCES = (Source.PREDICTION, Source.ARRIVAL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ class Shown:
 def _from_subject(shown: Shown) -> Start:
     subject = shown.given
     assert isinstance(subject, Subject)
-    fresh = seconds(shown.view.stamp - subject.stamp_ns) <= SAME_MOMENT
+    fresh = seconds(shown.view.stamp - subject.stamp_ns) <= SAME_MOMENT_TIME
     begun = start_from_keypoints(
         shown.model,
         shown.camera,
@@ -199,7 +199,12 @@ STARTS: tuple[
         _from_mixture,
     ),
     (Source.KEYPOINTS, lambda x: suffices(x.view.keypoints, x.model), 0.0, _from_keypoints),
-    (Source.PREDICTION, lambda x: x.view.prediction is not None, AT_ONCE, _from_prediction),
+    (
+        Source.PREDICTION,
+        lambda x: x.view.prediction is not None,
+        PREDICTION_LOG_ODDS,
+        _from_prediction,
+    ),
     (Source.KEYPOINTS, lambda x: shows_a_part(x.view.keypoints, x.model), 0.0, _from_keypoints),
     (Source.BOX, lambda x: x.box is not None, math.inf, _from_box),
     (Source.MASK, _masked, 0.0, _from_mask),
@@ -255,7 +260,7 @@ def poses_to_search(
     """
     found = []
     keypoints, depths = observation.keypoints, observation.evidence.get(DEPTH.name)
-    if keypoints is not None and keypoints.seen.sum() >= FEWEST_KEYPOINTS:
+    if keypoints is not None and keypoints.seen.sum() >= MIN_KEYPOINTS:
         explained = poses_from_keypoints(body, camera, keypoints, upright, depths)
         found.append(with_reversals(body, explained))
         found.append(lifted_poses(body, camera, keypoints))
@@ -274,4 +279,4 @@ def with_reversals(body: Body, poses: Array) -> Array:
     """
     if not body.trunk_pairs:
         return poses
-    return np.concatenate([poses, reverse_depth(body, poses[:REVERSED])])
+    return np.concatenate([poses, reverse_depth(body, poses[:MAX_REVERSED_POSES])])

@@ -50,16 +50,16 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.inference.markov_chain import MarkovChain
 from hmt_ros.tracking.hypotheses import Modes
-from hmt_ros.tracking.settings import FACING_VALID, LEAST_EXCHANGE, MAX_FACING_NATS
-from hmt_ros.tracking.weighting import Continuity
+from hmt_ros.tracking.settings import FACING_VALIDITY, MAX_FACING_NATS, MIN_EXCHANGE_PROBABILITY
+from hmt_ros.tracking.weighting import TransitionPrior
 
-EXCHANGES = MarkovChain(exchange_rates())
+EXCHANGE_CHAIN = MarkovChain(exchange_rates())
 
 
 # The facing direction.
 
 
-class Ways(NamedTuple):
+class FacingInputs(NamedTuple):
     """Inputs for the compiled function that weighs hypotheses of both facing directions.
 
     Attributes:
@@ -112,7 +112,7 @@ def lost_a_facing(back: Mask, log_weights: Array) -> bool:
     return bool(one_way or log_weights[back].max() > log_weights[~back].max() + MAX_FACING_NATS)
 
 
-def best_of_the_other_way(body: Body, joints: Array, log_weights: Array, least: float) -> list[int]:
+def best_of_other_facing(body: Body, joints: Array, log_weights: Array, least: float) -> list[int]:
     """Index of the heaviest pose that faces opposite to the overall heaviest, if any.
 
     The pose is kept while its facing direction has any weight, because small steps would not find
@@ -131,7 +131,7 @@ def best_of_the_other_way(body: Body, joints: Array, log_weights: Array, least: 
 
 def weigh_ways(
     modes: Modes,
-    continuity: Continuity,
+    transition_prior: TransitionPrior,
     joints: Array,
     transitions: Array,
     log_weights: Array,
@@ -142,7 +142,7 @@ def weigh_ways(
 
     Args:
         modes: K modes of the previous image.
-        continuity: transition densities to the image, with the predicted poses of the modes.
+        transition_prior: transition densities to the image, with the predicted poses of the modes.
         joints: (N, J, 3) joints of the poses, m.
         transitions: (K, N) log transition densities t(x_n, x_k) from the modes.
         log_weights: (N,) log weights, of which only ratios within a facing direction are used.
@@ -153,23 +153,23 @@ def weigh_ways(
         The log weights, the log odds (N,) of each pose's facing direction, and the term (K, N) that
         (6) adds to log t.
     """
-    body, dt = continuity.body, continuity.dt
+    body, dt = transition_prior.body, transition_prior.dt
     log_odds = -float(modes.facing[0])
     facing, turned = np.full(len(joints), -log_odds), np.zeros_like(transitions)
     if not body.trunk_pairs:
         return log_weights, facing, turned
     reversal = body.symmetries['reversal']
-    of_ways = Ways(
+    of_ways = FacingInputs(
         modes.back,
         ways(body, joints, body.joint_positions(modes.poses[:1])[0]),
         # The heading diffuses at the rate of the pelvis's rotation about the vertical.
         float(body.rates[root_rotation_dofs(body.skeleton)[0]]) * dt,
         reversal.after(log_odds, dt),
         reversal.price(dt),
-        FACING_VALID,
+        FACING_VALIDITY,
         MAX_FACING_NATS,
     )
-    result, first = np.empty_like(log_weights), continuity.joints
+    result, first = np.empty_like(log_weights), transition_prior.joints
     core.weigh_ways(
         trunk_of(body), of_ways, first, joints, transitions, log_weights, evidence, followed,
         result, facing, turned,
@@ -182,8 +182,8 @@ def weigh_ways(
 
 def predicted_exchanges(exchanges: Array, dt: float) -> Array:
     """Log probabilities (K, E) of exchanged sides dt seconds later, (4)."""
-    p = EXCHANGES.predict(elementary.exp(exchanges), dt)
-    return np.asarray(elementary.log(np.maximum(p, LEAST_EXCHANGE)), dtype=np.float64)
+    p = EXCHANGE_CHAIN.predict(elementary.exp(exchanges), dt)
+    return np.asarray(elementary.log(np.maximum(p, MIN_EXCHANGE_PROBABILITY)), dtype=np.float64)
 
 
 def known_exchanges(exchanges: Array) -> Array:

@@ -53,13 +53,13 @@ from hmt_ros.tracking.observer import View
 from hmt_ros.tracking.settings import (
     ABSENT_PROBABILITY,
     EXISTENCE_CUES,
-    MAJORITY,
+    MAJORITY_FRACTION,
     PART_FRACTION,
     PRESENT_PROBABILITY,
     RATES,
 )
 
-CHAIN = MarkovChain.of_two(*RATES['existence'])
+EXISTENCE_CHAIN = MarkovChain.of_two(*RATES['existence'])
 NO_MOTION = Motion(moved=False, still=False)
 
 
@@ -84,18 +84,20 @@ class Cue(NamedTuple):
     tau: float
 
 
-CLEAR, DOUBTFUL = (Cue(*EXISTENCE_CUES[name]) for name in ('clear', 'doubtful'))
+CLEAR_CUE, DOUBTFUL_CUE = (Cue(*EXISTENCE_CUES[name]) for name in ('clear', 'doubtful'))
 
 # Probability of existence before the first image, as after one clear image of nobody, and at a
 # given start, as after one clear image of a person.
-NOBODY_YET, GIVEN = of_log_odds([-CLEAR.nats, CLEAR.nats])[:, 1].tolist()
+INITIAL_PROBABILITY, GIVEN_PROBABILITY = of_log_odds([-CLEAR_CUE.nats, CLEAR_CUE.nats])[
+    :, 1
+].tolist()
 
 
 class Sighting(NamedTuple):
     """Evidence of all cues in an image for or against a person.
 
     Attributes:
-        said: log likelihood ratio of each cue, nats; positive for a person in view.
+        log_ratios: log likelihood ratio of each cue, nats; positive for a person in view.
         seen: whether the person can be tracked in the image: a cue shows a person, or the image is
             usable and no cue is evidence against a person.
         blank: whether modes cannot be fitted to the image, because others hide most of the person,
@@ -103,20 +105,20 @@ class Sighting(NamedTuple):
         hidden: whether other people hide most of the person.
         elsewhere: whether the track must search, because the image shows a person away from all
             modes, or after so long a time that the modes are useless.
-        there: whether the image shows the person, or is unchanged since an image that did.
+        still_in_view: whether the image shows the person, or is unchanged since an image that did.
     """
 
-    said: Mapping[str, float] = MappingProxyType({})
+    log_ratios: Mapping[str, float] = MappingProxyType({})
     seen: bool = False
     blank: bool = False
     hidden: bool = False
     elsewhere: bool = False
-    there: bool = True
+    still_in_view: bool = True
 
     @property
     def llr(self) -> float:
         """Log likelihood ratio of all cues, nats; positive for a person in view."""
-        return sum(self.said.values())
+        return sum(self.log_ratios.values())
 
 
 class Existence:
@@ -127,14 +129,14 @@ class Existence:
 
     Attributes:
         last: evidence from the last image.
-        told: timestamp of the last evidence of each cue, ns.
+        last_evidence: timestamp of the last evidence of each cue, ns.
         appearance: appearance of the person.
     """
 
-    def __init__(self, probability: float = NOBODY_YET) -> None:
+    def __init__(self, probability: float = INITIAL_PROBABILITY) -> None:
         self._p = np.array([1.0 - probability, probability])
         self.last = Sighting()
-        self.told: dict[str, int] = {}
+        self.last_evidence: dict[str, int] = {}
         self.appearance = Appearance()
         self._stamps: tuple[int, int] | None = None  # first and last image, ns
         self._still = StillPicture()
@@ -160,7 +162,7 @@ class Existence:
         """Whether nobody is in view, and the last image was evidence of that."""
         return self.probability < ABSENT_PROBABILITY and self.last.llr < 0.0
 
-    def look(self, view: View, body: Body, *, waiting: bool = False) -> None:
+    def update(self, view: View, body: Body, *, waiting: bool = False) -> None:
         """Updates the probability from the next image.
 
         Args:
@@ -172,23 +174,25 @@ class Existence:
         # Motion is used only without another cue.
         alone = view.anywhere is None and view.keypoints is None and not waiting
         motion = self.appearance.motion(view) if alone else NO_MOTION
-        still = motion.still and self.last.there
+        still = motion.still and self.last.still_in_view
         if self._stamps is not None and not still:
-            self._p = CHAIN.predict(self._p, seconds(stamp - self._stamps[1]))
+            self._p = EXISTENCE_CHAIN.predict(self._p, seconds(stamp - self._stamps[1]))
         # A person who has not been seen for long may have left.
-        forgotten = bool(CHAIN.closed(1.0, self.appearance.unseen(stamp)) < MAJORITY)
-        hidden = self.appearance.open_to_view(view.others) < 1.0 - MAJORITY
+        forgotten = bool(
+            EXISTENCE_CHAIN.closed(1.0, self.appearance.unseen(stamp)) < MAJORITY_FRACTION
+        )
+        hidden = self.appearance.uncovered_share(view.others) < 1.0 - MAJORITY_FRACTION
         cues, usable, apart = self._cues(view, body)
         denied = min((value * cue.nats for value, cue in cues.values()), default=0.0)
-        if motion.moved and denied > -0.5 * DOUBTFUL.nats:
-            cues['motion'] = 1.0, DOUBTFUL
-        detected = cues.get('detector', (0.0, CLEAR))[0] > 0.0
+        if motion.moved and denied > -0.5 * DOUBTFUL_CUE.nats:
+            cues['motion'] = 1.0, DOUBTFUL_CUE
+        detected = cues.get('detector', (0.0, CLEAR_CUE))[0] > 0.0
         keypoints = view.keypoints if waiting and detected else None
         if keypoints is not None and self._still.shows_again(view.image, keypoints):
             del cues['detector']
         if hidden:
             cues = {name: cue for name, cue in cues.items() if cue[0] > 0.0}
-        said = {
+        log_ratios = {
             name: value * cue.nats * share_of_time(self._time_since(name, stamp), cue.tau)
             for name, (value, cue) in cues.items()
         }
@@ -196,15 +200,15 @@ class Existence:
         shown = any(value > 0.0 for value in values)
         seen = shown or (usable and not any(value < 0.0 for value in values))
         self.last = Sighting(
-            said,
+            log_ratios,
             seen=seen,
             blank=not seen and (hidden or view.silhouette is not None),
             hidden=hidden,
             elsewhere=shown and (forgotten or apart),
-            there=shown or still,
+            still_in_view=shown or still,
         )
         self._p = update(self._p, [0.0, self.last.llr])
-        self.told |= dict.fromkeys(cues, stamp)
+        self.last_evidence |= dict.fromkeys(cues, stamp)
         self._stamps = stamp if self._stamps is None else self._stamps[0], stamp
 
     def _cues(self, view: View, body: Body) -> tuple[dict[str, tuple[float, Cue]], bool, bool]:
@@ -220,29 +224,29 @@ class Existence:
         if found is not None:
             usable = True
             part = PART_FRACTION if found.cut and found.by_place <= 0.0 < found.by_area else 1.0
-            cues['silhouette'] = part * found.evidence, CLEAR
+            cues['silhouette'] = part * found.evidence, CLEAR_CUE
             apart = found.by_place < 0.0 < found.by_area
         if view.keypoints is not None:
             value = keypoint_evidence(view.keypoints, body)
             if value > 0.0:
                 part = 1.0 if suffices(view.keypoints, body) else PART_FRACTION
-                cues['detector'] = part * value, CLEAR
+                cues['detector'] = part * value, CLEAR_CUE
                 apart = apart or self.appearance.is_apart(view, view.stamp)
             else:
-                cues['detector'] = value, DOUBTFUL
+                cues['detector'] = value, DOUBTFUL_CUE
         if view.predicted is not None and (not view.predicted or view.anywhere is None):
-            cues['predictor'] = (1.0, CLEAR) if view.predicted else (-1.0, DOUBTFUL)
+            cues['predictor'] = (1.0, CLEAR_CUE) if view.predicted else (-1.0, DOUBTFUL_CUE)
         if found is None and not any(value > 0.0 for value, _ in cues.values()):
             colours = self.appearance.colour_evidence(view)
             # If most of the image has changed, the colours may have changed, too.
             if colours is not None and (usable or colours[0]):
                 there, part = colours
-                nats = part * DOUBTFUL.nats
-                cues['colours'] = 1.0 if there else -1.0, DOUBTFUL._replace(nats=nats)
+                nats = part * DOUBTFUL_CUE.nats
+                cues['colours'] = 1.0 if there else -1.0, DOUBTFUL_CUE._replace(nats=nats)
         return cues, usable, apart
 
     def _time_since(self, cue: str, stamp: int) -> float:
         """Time since the last evidence from a cue, s; infinite in the first image."""
         if self._stamps is None:
             return math.inf
-        return seconds(stamp - self.told.get(cue, self._stamps[0]))
+        return seconds(stamp - self.last_evidence.get(cue, self._stamps[0]))

@@ -28,7 +28,7 @@ from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.inference.linear_algebra import inverse, log_sum_exp
 from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.classes import (
-    best_of_the_other_way,
+    best_of_other_facing,
     first_facing,
     seen_exchanges,
     ways,
@@ -59,13 +59,18 @@ from hmt_ros.tracking.prediction import dynamics_of, follow_flow, predict
 from hmt_ros.tracking.proposals import proposals_of, propose
 from hmt_ros.tracking.proposals.whole_poses import PoseByKeypoints, keypoint_poses
 from hmt_ros.tracking.selection import choose_hypotheses, distinct_hypotheses
-from hmt_ros.tracking.settings import FIRST_SHAPE_FITS, POSTURE_BITS, SHAPE_MODES, TrackerSettings
+from hmt_ros.tracking.settings import (
+    FIRST_SHAPE_FITS,
+    MAX_SHAPE_MODES,
+    POSTURE_BITS,
+    TrackerSettings,
+)
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
 from hmt_ros.tracking.validity import ByKeypoints
-from hmt_ros.tracking.weighting import Continuity, at_least, normalised, pooled_origins
+from hmt_ros.tracking.weighting import TransitionPrior, at_least, normalised, pooled_origins
 
 
-class Judged(NamedTuple):
+class CueMisfits(NamedTuple):
     """Misfits of the modes to the cues of an image.
 
     Attributes:
@@ -73,7 +78,7 @@ class Judged(NamedTuple):
         alone: pose fitted to keypoints alone; None: not needed.
     """
 
-    misfits: dict[str, Misfit]
+    by_cue: dict[str, Misfit]
     alone: ByKeypoints | None
 
 
@@ -125,16 +130,16 @@ class MixtureFilter:
         self._points: SurfacePoints | None = None
         self._by_keypoints = PoseByKeypoints()
         self._proposals = proposals_of(settings.proposals)
-        self._use_body(body)
+        self._replace_body(body)
 
     @property
     def person(self) -> Body:
         """Body with larger standard deviations of the joints of unseen limbs."""
-        return self.limbs.told(self.body)
+        return self.limbs.with_larger_errors(self.body)
 
     # The start.
 
-    def begin(self, start: Start, observation: Observation) -> Judged:
+    def begin(self, start: Start, observation: Observation) -> CueMisfits:
         """Starts a track from an observation of its first image."""
         self.spent.clear()
         poses = start.poses
@@ -147,7 +152,7 @@ class MixtureFilter:
         if start.clicked is not None:
             seen = replace(observation, keypoints=start.clicked)
         if start.body is not self.body:
-            self._use_body(start.body)
+            self._replace_body(start.body)
         self.shape = ShapeEstimate(start.body)
 
         def settle(starts: Array, iterations: int) -> Array:
@@ -162,9 +167,9 @@ class MixtureFilter:
             if not self._fit_shape(seen, ERRORS['shape'].independent / FIRST_SHAPE_FITS):
                 break
             found = settle(found, self.settings.iterations)
-        return self._judge(observation)
+        return self._cue_misfits(observation)
 
-    def begin_anew(self, poses: Array, observation: Observation) -> Judged:
+    def restart(self, poses: Array, observation: Observation) -> CueMisfits:
         """Restarts the track in an image, from the present modes and from poses (N, d)."""
         self.spent.clear()
         poses = np.concatenate([self.modes.poses, poses])
@@ -172,7 +177,7 @@ class MixtureFilter:
         solved = self.posterior.minimise(term, poses, 3 * self.settings.iterations)
         start = new_hypotheses(solved.x, np.zeros(len(poses)))
         self._initialise(Optimised(start, solved), observation)
-        return self._judge(observation)
+        return self._cue_misfits(observation)
 
     def _initialise(self, optimised: Optimised, observation: Observation) -> None:
         """Sets the modes of a new track, at zero velocity."""
@@ -199,7 +204,7 @@ class MixtureFilter:
 
     def propagate(
         self, observation: Observation, dt: float, prediction: PosePrediction | None
-    ) -> Judged:
+    ) -> CueMisfits:
         """Propagates the mixture to the next image.
 
         Args:
@@ -211,18 +216,18 @@ class MixtureFilter:
         self.spent.clear()
         predicted, states = predict(modes, self.body, self.dynamics, dt)
         precisions = inverse(states.pose_covariances)
-        continuity = Continuity(self.body, predicted.poses, modes.log_weights, dt)
+        transition_prior = TransitionPrior(self.body, predicted.poses, modes.log_weights, dt)
         predicted = follow_flow(predicted, precisions, self._points, observation, posterior)
         term = posterior.given(observation, predicted.expected, precisions, predicted.exchanges)
         base = posterior.minimise(term, predicted.poses, s.plan.iterations)
-        moved = base.x[0] - continuity.predicted[0]
+        moved = base.x[0] - transition_prior.predicted[0]
         surprising = is_surprising(moved, precisions[0], base.hessian[0])
         search = Search(
             posterior,
             observation,
             states,
             precisions,
-            continuity,
+            transition_prior,
             s.thorough_plan if surprising else s.plan,
             modes,
             prediction,
@@ -237,7 +242,7 @@ class MixtureFilter:
         found = search.optimise(candidates).joined(Optimised(predicted, base))
         self._select(*self._weigh(search, found), observation, search)
         self._fit_shape(observation, ERRORS['shape'].share(dt))
-        return self._judge(observation, search)
+        return self._cue_misfits(observation, search)
 
     # The steps.
 
@@ -255,11 +260,11 @@ class MixtureFilter:
         same = self.settings.hypothesis_merge_distance
         rows = order[distinct_hypotheses((joints - joints[:, :1])[order], ranks, same)]
         optimised, joints, evidence = optimised[rows], joints[rows], evidence[rows]
-        transitions = search.continuity.log_transitions(joints)
-        histories = search.continuity.log_histories(joints, transitions)
+        transitions = search.transition_prior.log_transitions(joints)
+        histories = search.transition_prior.log_histories(joints, transitions)
         log_weights, facing, turned = weigh_ways(
             search.modes,
-            search.continuity,
+            search.transition_prior,
             joints,
             transitions,
             log_sum_exp(histories, axis=0) - evidence,
@@ -293,13 +298,13 @@ class MixtureFilter:
         before = None if search is None else search.modes
         dt = np.inf if search is None else search.dt
         best = poses[int(np.argmax(log_weights))]
-        self.limbs.look(self.body, self.camera, observation, best, dt)
+        self.limbs.update(self.body, self.camera, observation, best, dt)
         kept = choose_hypotheses(
             (joints - joints[:, :1])[:, self.limbs.shown_joints(self.body)],
             log_weights,
             s.plan.hypotheses,
             same=s.hypothesis_merge_distance,
-            first=best_of_the_other_way(self.body, joints, log_weights, s.least_log_weight),
+            first=best_of_other_facing(self.body, joints, log_weights, s.least_log_weight),
         )
         weights = at_least(normalised(kept.log_weights), s.least_log_weight)
         order = np.argsort(-weights, kind='stable')
@@ -357,7 +362,7 @@ class MixtureFilter:
 
     # Learning.
 
-    def _judge(self, observation: Observation, search: Search | None = None) -> Judged:
+    def _cue_misfits(self, observation: Observation, search: Search | None = None) -> CueMisfits:
         """Computes the misfits of the modes to an image.
 
         Args:
@@ -383,17 +388,17 @@ class MixtureFilter:
             self.misfit = max(self.misfit, missed.share)
             if search is not None and SILHOUETTE in found:
                 alone = self._by_keypoints.follow(search, modes.poses[0], term, missed)
-        return Judged(found, alone)
+        return CueMisfits(found, alone)
 
-    def _fit_shape(self, observation: Observation, trust: float) -> bool:
+    def _fit_shape(self, observation: Observation, image_share: float) -> bool:
         """Updates the shape from an image; returns False if the image has no evidence of it."""
         if not self.settings.estimate_shape:
             return False
         if observation.outline is None and observation.keypoints is None:
             return False
-        best = slice(SHAPE_MODES)
+        best = slice(MAX_SHAPE_MODES)
         poses, weights = self.modes.poses, elementary.exp(self.modes.log_weights[best])
-        gradients, covariances = self.posterior.fit(poses, observation).given_way
+        gradients, covariances = self.posterior.fit(poses, observation).free_response
         body = self.shape.update(
             self.posterior.likelihood,
             observation,
@@ -401,14 +406,14 @@ class MixtureFilter:
             weights / weights.sum(),
             gradients[best],
             covariances[best],
-            trust=trust,
+            image_share=image_share,
         )
         self.spent.append(len(weights))
         if body is not self.body:
-            self._use_body(body)
+            self._replace_body(body)
         return True
 
-    def _use_body(self, body: Body) -> None:
+    def _replace_body(self, body: Body) -> None:
         """Replaces the body by another one with the same degrees of freedom."""
         self.body = body
         self.dynamics = dynamics_of(body, self.settings.motion)

@@ -163,7 +163,7 @@ class GroundEstimator:
         self._levels: deque[tuple[float, float]] = deque()
         self._time = 0.0
         self._distance = USUAL_DISTANCE
-        self._conclude()
+        self._refresh_estimate()
 
     def carry(self, motion: CameraMotion) -> None:
         """Transforms known and estimated values to the camera frame of the next image.
@@ -185,7 +185,7 @@ class GroundEstimator:
         if self._seen is not None:
             self._seen = replace(self._seen, up=motion.directions(self._seen.up))
         self._levels = deque((time, level + rise) for time, level in self._levels)
-        self._conclude()
+        self._refresh_estimate()
 
     def set_gravity(
         self, up: ArrayLike, camera_height: float | None = None, up_sigma: float = GIVEN_UP_SIGMA
@@ -195,7 +195,7 @@ class GroundEstimator:
         self.turning = before is not None and length(vector - before) > TURN_NOISE
         height = self.known.camera_height if camera_height is None else camera_height
         self.known = KnownGround(vector, height, up_sigma)
-        self._conclude()
+        self._refresh_estimate()
 
     @property
     def reversed(self) -> bool:
@@ -227,15 +227,15 @@ class GroundEstimator:
         up = self.known.up
         return up if up is None or not self.reversed else -up
 
-    def see(self, keypoints: Keypoints) -> None:
+    def update_sign_by_keypoints(self, keypoints: Keypoints) -> None:
         """Updates the sign of the given vertical from the trunk of a detected person."""
         if self.known.up is not None:
             trunk = keypoints.trunk
             size = max(length(trunk), np.finfo(np.float64).eps)
             self._by_keypoints += _dot(trunk, self.known.up[:2]) / size
-            self._conclude()
+            self._refresh_estimate()
 
-    def look(self, image: Image, camera: Camera, stamp: int) -> None:
+    def update_by_lines(self, image: Image, camera: Camera, stamp: int) -> None:
         """Updates the vertical from lines of an image, once per `VERTICAL_TIME`; stamp in ns."""
         if self._looked is not None and 0 <= seconds(stamp - self._looked) < VERTICAL_TIME:
             return
@@ -251,7 +251,7 @@ class GroundEstimator:
             said = -float(elementary.log(found.agreement(given, self.known.up_sigma)))
             said = min(max(said, -LOOK_NATS), LOOK_NATS)
             self._by_lines = min(max(self._by_lines + said, -LOOK_NATS), 2.0 * LOOK_NATS)
-        self._conclude()
+        self._refresh_estimate()
 
     @property
     def vertical_known(self) -> bool:
@@ -316,19 +316,19 @@ class GroundEstimator:
         if mass.known:
             axis = product(weights, unit(mass.centre_of_mass(frames) - points.mean(1)))
             if self._given is not None:
-                self._by_person = self._said_by_person(_dot(axis, self._given), dt)
+                self._by_person = self._log_odds_by_person(_dot(axis, self._given), dt)
             elif self._seen is None:
                 self._follow_axis(axis, place, resting, dt)
-                self._conclude()
+                self._refresh_estimate()
         up = self.estimate.up
         level = float(-_dot(weights, product(points, up).min(1)))
         self._levels.append((self._time, level))
         while self._levels[0][0] < self._time - LEVEL_TIME:
             self._levels.popleft()
         self._distance = length(place - up * _dot(up, place))
-        self._conclude()
+        self._refresh_estimate()
 
-    def _said_by_person(self, cosine: float, dt: float) -> float:
+    def _log_odds_by_person(self, cosine: float, dt: float) -> float:
         """Log odds against the given vertical, nats, from its cosine with a person's axis."""
         stands = 2.0 * UPRIGHT_CONCENTRATION
         stands *= elementary.exp(UPRIGHT_CONCENTRATION * (cosine - 1.0))
@@ -358,7 +358,7 @@ class GroundEstimator:
         values = np.clip(values, AXIS_SIGMA**2, UP_SIGMA**2)
         self._covariance = product(vectors * values, vectors.T)
 
-    def _conclude(self) -> None:
+    def _refresh_estimate(self) -> None:
         known, seen, given = self.known, self._seen, self._given
         if given is not None and seen is not None:
             seen = seen.refined(given, known.up_sigma)

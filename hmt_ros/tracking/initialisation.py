@@ -21,7 +21,7 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import AXES, Camera
 from hmt_ros.body.ground_terms import without_root_lean
 from hmt_ros.body.kinematics import directed_derivatives, forward, joint_length_jacobians
-from hmt_ros.body.model_file import held
+from hmt_ros.body.model_file import conditioned_covariance
 from hmt_ros.core import elementary
 from hmt_ros.flips.interpretation_tree import distinct_poses, enumerate_flips
 from hmt_ros.image.joint_depths import MIN_JOINTS, JointDepths, joint_depths
@@ -44,17 +44,17 @@ from hmt_ros.tracking.misfit import of_depth
 from hmt_ros.tracking.settings import (
     BOX_SIGMA,
     GATE_SIGMAS,
-    HEADINGS,
+    HEADING_COUNT,
     MAX_STARTS,
     MEASURED_SIGMA,
     START_DISTANCE,
 )
-from hmt_ros.tracking.validity import UNDECIDED
+from hmt_ros.tracking.validity import UNDECIDED_MISFITS
 
 # Standard deviation of a measured stature, m: the model has no skull and no heels.
 STATURE_SIGMA = 2.0 * MEASURED_SIGMA
 NO_POSE = 'no pose of the body explains the keypoints: are they in the image?'
-LEAST_SQUARES = TermSettings(1.0, 1.0, np.inf)
+MIN_SQUARES = TermSettings(1.0, 1.0, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ def start_from_keypoints(
     if depths is not None:
         (misfit,) = of_depth(own, camera, poses[:1], depths)
         people = _is_a_stature(sized, own.skeleton.lengths)
-        if not (people and misfit <= UNDECIDED[DEPTH.name]):
+        if not (people and misfit <= UNDECIDED_MISFITS[DEPTH.name]):
             return start_from_keypoints(body, camera, subject, upright=upright)
     return Start(own, poses)
 
@@ -135,7 +135,7 @@ def _with_flips(
     Raises:
         ValueError: no pose fits.
     """
-    least_squares = LikelihoodSettings.of_terms(keypoints=LEAST_SQUARES, depth=DEPTH.settings)
+    least_squares = LikelihoodSettings.of_terms(keypoints=MIN_SQUARES, depth=DEPTH.settings)
     settings = replace(least_squares, prior_weight=1.0)
     leaning = body if upright is None else without_root_lean(body)
     likelihood = ImageLikelihood(leaning, camera, settings)
@@ -144,7 +144,7 @@ def _with_flips(
     terms = (*likelihood.seen(observation, exchanges=NOT_EXCHANGED), *likelihood.priors)
     energy = PoseEnergy(likelihood, terms if upright is None else (*terms, upright.term(body)))
 
-    heads = _distinct(energy.minimise(guesses), body, HEADINGS // 2)
+    heads = _distinct(energy.minimise(guesses), body, HEADING_COUNT // 2)
     if len(heads.x) == 0:
         raise ValueError(NO_POSE)
     trees = [enumerate_flips(body, heads.x, c)[0] for c in (*body.chains, *body.chain_pairs)]
@@ -174,7 +174,7 @@ def poses_from_keypoints(
     poses = _with_flips(body, camera, keypoints, upright, depths, guesses)
     if depths is not None:
         (misfit,) = of_depth(body, camera, poses[:1], depths)
-        if not misfit <= UNDECIDED[DEPTH.name]:
+        if not misfit <= UNDECIDED_MISFITS[DEPTH.name]:
             return poses_from_keypoints(body, camera, keypoints, upright)
     return poses
 
@@ -197,13 +197,13 @@ def mixture_from_box(body: Body, camera: Camera, box: Box) -> GaussianMixture:
     rays = _level_rays(body, camera, sides)
     poses = _poses_between(body, rays.min(0), rays.max(0))
     variances = np.tile(
-        np.where(np.isfinite(body.prior_sigma), body.prior_sigma, 0.5) ** 2, (HEADINGS, 1)
+        np.where(np.isfinite(body.prior_sigma), body.prior_sigma, 0.5) ** 2, (HEADING_COUNT, 1)
     )
     places = np.flatnonzero(~body.skeleton.dof_is_rotation)
     variances[:, places] = (BOX_SIGMA * poses[:, 2:3]) ** 2
-    variances[:, body.dof_names.index('root_z')] = (np.pi / HEADINGS) ** 2
+    variances[:, body.dof_names.index('root_z')] = (np.pi / HEADING_COUNT) ** 2
     covariances = variances[:, :, None] * np.eye(body.dimension)
-    return GaussianMixture(np.full(HEADINGS, 1.0 / HEADINGS), poses, covariances)
+    return GaussianMixture(np.full(HEADING_COUNT, 1.0 / HEADING_COUNT), poses, covariances)
 
 
 def check_box(box: Box, camera: Camera) -> None:
@@ -231,9 +231,11 @@ def _level_rays(body: Body, camera: Camera, pixels: Array) -> Array:
 def _poses_between(body: Body, low: Array, high: Array) -> Array:
     """Mean poses (HEADINGS, d) at several headings that fill a box of level rays (2,)."""
     middle = 0.5 * (low + high)
-    result = np.tile(body.prior_mean, (HEADINGS, 1))
+    result = np.tile(body.prior_mean, (HEADING_COUNT, 1))
     result[:, :3] = 0.0
-    result[:, body.dof_names.index('root_z')] = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
+    result[:, body.dof_names.index('root_z')] = np.linspace(
+        -np.pi, np.pi, HEADING_COUNT, endpoint=False
+    )
     heights = product(body.joint_positions(result), body.level)[..., 1]
     top, bottom = heights.min(1), heights.max(1)
     depth = (bottom - top) / max(high[1] - low[1], np.finfo(np.float64).eps)
@@ -259,7 +261,7 @@ def _sized(body: Body, subject: Subject) -> Body:
     if subject.stature is not None:
         rows.append(body.stature_rates[None])
         sigma.append(STATURE_SIGMA)
-    covariance = held(body.length_covariance, np.concatenate(rows), sigma)
+    covariance = conditioned_covariance(body.length_covariance, np.concatenate(rows), sigma)
     return replace(body, length_covariance=covariance)
 
 
@@ -282,7 +284,7 @@ def _fit_with_lengths(
     skeleton = body.skeleton
     d, count = body.dimension, len(skeleton.length_names)
     # Lifted 3D positions are used only once the lengths are known.
-    term = KeypointTerm(skeleton, camera, replace(keypoints, positions=None), LEAST_SQUARES)
+    term = KeypointTerm(skeleton, camera, replace(keypoints, positions=None), MIN_SQUARES)
     residuals = 2 * int(keypoints.seen.sum())
     sigma = body.length_sigma
     length_precision = inverse(body.length_covariance)
@@ -343,7 +345,7 @@ def _fit_with_lengths(
     starts = np.concatenate(
         [
             _first_guesses(body, camera, keypoints, upright, measured),
-            np.tile(default, (HEADINGS, 1)),
+            np.tile(default, (HEADING_COUNT, 1)),
         ],
         axis=1,
     )
@@ -387,9 +389,9 @@ def _first_guesses(
     if len(measured.depths) >= MIN_JOINTS:
         depth = float(np.median(measured.depths))
     middle = rays.mean(0) * depth
-    result = np.tile(pose, (HEADINGS, 1))
+    result = np.tile(pose, (HEADING_COUNT, 1))
     turn = body.dof_names.index('root_z')
-    result[:, turn] = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
+    result[:, turn] = np.linspace(-np.pi, np.pi, HEADING_COUNT, endpoint=False)
     if upright is not None:
         result = upright.turned(body, result)
     turned = body.joint_positions(result)[:, body.skeleton.joint_index(names)]

@@ -1,11 +1,11 @@
 """Landmark offsets of one person, learned while other cues locate the person.
 
-    pixel_l = project(J_l + R_l (o_l + d_l)) + e,     d_l ~ N(0, PRIOR^2)
+    pixel_l = project(J_l + R_l (o_l + d_l)) + e,     d_l ~ N(0, OFFSET_SIGMA^2)
 
 o_l is the usual offset of landmark l in the frame of its segment, R_l, and d_l the deviation due to
-person, clothes and detector. Errors of a keypoint persist for seconds, so at most `RATE` images per
-second count. Keypoints alone cannot distinguish an offset from a pose, so edges or silhouettes must
-be evidence, too.
+person, clothes and detector. Errors of a keypoint persist for seconds, so at most `MAX_RATE` images
+per second count. Keypoints alone cannot distinguish an offset from a pose, so edges or silhouettes
+must be evidence, too.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.linear_algebra import product, solve
 
 # Standard deviations of an offset d_l, and of a keypoint's error at the person's distance, m.
-PRIOR, SIGMA = 0.02, 0.03
+OFFSET_SIGMA, KEYPOINT_SIGMA = 0.02, 0.03
 # Scale of the robust kernel, m; minimum confidence of a keypoint; effective images per second.
-KERNEL, LEAST_CONFIDENCE, RATE = 0.06, 0.5, 4.0
+KERNEL_SCALE, MIN_CONFIDENCE, MAX_RATE = 0.06, 0.5, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class LandmarkOffsets:
     @cached_property
     def offsets(self) -> Array:
         """Most probable offsets (n, 3), m."""
-        known = self.precision + np.eye(3) / PRIOR**2
+        known = self.precision + np.eye(3) / OFFSET_SIGMA**2
         return np.asarray(solve(known, self.pull[..., None])[..., 0])
 
     def applied(self, keypoints: Keypoints | None) -> Keypoints | None:
@@ -72,7 +72,7 @@ class LandmarkOffsets:
         segments = body.skeleton.joint_segments[which]
         frames = forward(body.skeleton, pose[None])
         places = frames.places(segments, body.skeleton.joint_offsets[which] + keypoints.offsets)[0]
-        seen = keypoints.seen & (keypoints.confidences > LEAST_CONFIDENCE) & (places[:, 2] > 0)
+        seen = keypoints.seen & (keypoints.confidences > MIN_CONFIDENCE) & (places[:, 2] > 0)
         if not seen.any():
             return known
         pixels, slopes = camera.project_with_derivative(places[seen].T)
@@ -80,8 +80,8 @@ class LandmarkOffsets:
         slopes = product(slopes.transpose(2, 0, 1), frames.rotations()[0, segments[seen]])
         slopes = slopes / size[:, None, None]
         errors = (keypoints.pixels[seen] - pixels.T) / size[:, None]
-        weights = min(RATE * dt, 1.0) / SIGMA**2
-        weights = weights / (1.0 + np.square(errors).sum(1) / KERNEL**2) ** 2
+        weights = min(MAX_RATE * dt, 1.0) / KEYPOINT_SIGMA**2
+        weights = weights / (1.0 + np.square(errors).sum(1) / KERNEL_SCALE**2) ** 2
         by_weight = weights[:, None, None] * slopes
         precision, pull = known.precision.copy(), known.pull.copy()
         information = product(by_weight.transpose(0, 2, 1), slopes)

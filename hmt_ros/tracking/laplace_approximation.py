@@ -27,8 +27,8 @@ from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.inference.error_model import (
-    LIFTED_AS_KEYPOINTS,
-    TOGETHER,
+    JOINT_COVARIANCE_RATIO,
+    LIFTED_INFORMATION_RATIO,
     CueErrors,
     errors_of_cues,
 )
@@ -107,9 +107,9 @@ def posterior_modes(
     covariances = alone = filtered
     measured = bool(observation.evidence) or observation.keypoints is not None
     if measured:
-        alone = fit.lasting(solved.free, dt)
-        covariances = TOGETHER * alone + shape.considered(
-            posterior.likelihood, observation, poses, fit.given_way[1]
+        alone = fit.persistent_covariances(solved.free, dt)
+        covariances = JOINT_COVARIANCE_RATIO * alone + shape.induced_covariances(
+            posterior.likelihood, observation, poses, fit.free_response[1]
         )
     if states is None:
         velocities = np.zeros_like(poses)
@@ -159,7 +159,7 @@ def likelihood_modes(
         before: timestamp, ns, and likelihood of the previous image; unused at a start.
     """
     body, poses = posterior.body, modes.poses
-    fit = posterior.fit(poses, observation, LIFTED_AS_KEYPOINTS)
+    fit = posterior.fit(poses, observation, LIFTED_INFORMATION_RATIO)
     gradient, covariances = fit.energy.derivatives()[0], fit.covariances
     means, limits = np.empty_like(poses), np.stack([body.lower, body.upper])
     shift_modes(
@@ -171,8 +171,8 @@ def likelihood_modes(
     mixture = GaussianMixture(weights[order], means[order], covariances[order])
     seen = PoseEnergy(posterior.likelihood, posterior.likelihood.seen(observation))
     values = -seen.energy(mixture.means, derivatives=Derivatives.NONE).value
-    (unknown,) = shape.considered(
-        posterior.likelihood, observation, poses[:1], fit.given_way[1][:1]
+    (unknown,) = shape.induced_covariances(
+        posterior.likelihood, observation, poses[:1], fit.free_response[1][:1]
     )
     stamp, ancestral = before
     follows = modes.origins.shape[1] > 0

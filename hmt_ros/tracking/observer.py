@@ -152,7 +152,7 @@ class Observer:
             keypoints = None
         found = observe(
             view.image,
-            view.silhouette if validity.believes(SILHOUETTE) else None,
+            view.silhouette if validity.is_trusted(SILHOUETTE) else None,
             keypoints,
             last_image=self.last_image if self._settings.flow_weight > 0 else None,
             wanted=wanted,
@@ -163,7 +163,7 @@ class Observer:
         )
         evidence = dict(found.evidence)
         depths = evidence.get(DEPTH.name)
-        if not validity.believes(DEPTH.name):
+        if not validity.is_trusted(DEPTH.name):
             evidence.pop(DEPTH.name, None)
         magnification = 0.0 if pose is None else self._camera.magnification(float(pose[2]))
         return replace(

@@ -29,7 +29,7 @@ from hmt_ros.tracking.hypotheses import Hypotheses, Modes, Optimised, PosePredic
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.selection import choose_hypotheses
 from hmt_ros.tracking.settings import SURPRISING_RATIO, EvaluationPlan
-from hmt_ros.tracking.weighting import Continuity
+from hmt_ros.tracking.weighting import TransitionPrior
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Search:
         observation: observation of the image.
         states: predicted states of the previous modes.
         precisions: (K, d, d) inverse covariances of the predicted poses.
-        continuity: transition densities from the previous modes.
+        transition_prior: transition densities from the previous modes.
         plan: allocation of the evaluations of the image.
         modes: modes of the previous image.
         prediction: pose hypotheses from an external predictor, if any.
@@ -53,7 +53,7 @@ class Search:
     observation: Observation
     states: PredictedStates
     precisions: Array
-    continuity: Continuity
+    transition_prior: TransitionPrior
     plan: EvaluationPlan
     modes: Modes
     prediction: PosePrediction | None
@@ -62,7 +62,7 @@ class Search:
     @property
     def dt(self) -> float:
         """Time since the previous image, s."""
-        return self.continuity.dt
+        return self.transition_prior.dt
 
     @cached_property
     def base_joints(self) -> Array:
@@ -75,7 +75,9 @@ class Search:
         return self._rated(self.base_joints, self.base.value)
 
     def _rated(self, joints: Array, energies: Array) -> Array:
-        return self.continuity.rated(joints) - ERRORS['image'].share(self.dt) * energies
+        return (
+            self.transition_prior.log_predictive(joints) - ERRORS['image'].share(self.dt) * energies
+        )
 
     def best(self, poses: Array, energies: Array) -> Index:
         """Rows of at most `candidates` representatives of poses (N, d) with energies (N,)."""

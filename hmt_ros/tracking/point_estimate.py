@@ -25,12 +25,12 @@ from hmt_ros.inference.linear_algebra import product, solve
 from hmt_ros.inference.mixture import GaussianMixture
 
 # Number of steps (3); more steps hardly change the result. Chosen by accuracy on tracked clips.
-STEPS = 2
+MAX_STEPS = 2
 # Distance e of joints below which modes agree, m: the amplitude of jitter. Chosen by accuracy on
 # tracked clips.
-AGREED = 0.03
+AGREEMENT_DISTANCE = 0.03
 # Lever l of joints about an axis below which the angle stays at the weighted mean, m. Chosen.
-LEVER = 0.01
+MIN_LEVER = 0.01
 
 
 def point_estimate(body: Body, posterior: GaussianMixture) -> Array:
@@ -48,7 +48,7 @@ def point_estimate(body: Body, posterior: GaussianMixture) -> Array:
     places = body.relative_joints(poses)
     leader = poses[int(weights.argmax())]
     pose = leader + product(weights, _differences(body, poses, leader))
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         pose = np.clip(pose, body.lower, body.upper)
         pose = pose + _step(body, pose, places, weights)
     return np.asarray(np.clip(pose, body.lower, body.upper))
@@ -70,12 +70,12 @@ def _step(body: Body, pose: Array, places: Array, weights: Array) -> Array:
     now, jacobian = body.relative_joints(pose[None])[0], body.joint_jacobians(pose[None])[0]
     offsets = places - now
     away = np.sqrt((offsets * offsets).sum(2))
-    shares = weights[:, None] / np.maximum(away, AGREED)  # s_kj
+    shares = weights[:, None] / np.maximum(away, AGREEMENT_DISTANCE)  # s_kj
     total = shares.sum(0)
     pulls = (shares[..., None] * offsets).sum(0)  # S_j (t_j - p_j)
     levers = (jacobian - jacobian[:1]).reshape(-1, len(pose))
     each = np.repeat(total, 3)[:, None]
-    normal = product(levers.T, each * levers) + LEVER**2 * total.sum() * np.eye(len(pose))
+    normal = product(levers.T, each * levers) + MIN_LEVER**2 * total.sum() * np.eye(len(pose))
     return np.asarray(solve(normal, product(levers.T, pulls.ravel())))
 
 

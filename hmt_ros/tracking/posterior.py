@@ -32,7 +32,7 @@ from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.settings import LIMIT_SIGMA, MAX_SIGMA, MINIMUM_TOLERANCE, TrackerSettings
 
 # Weight of a Hessian that is not split by cue.
-ALONE = np.ones(1)
+WHOLE_SHARE = np.ones(1)
 # Precisions of a variable on a limit, and of an unknown variable.
 PRECISIONS = 1.0 / LIMIT_SIGMA**2, 1.0 / MAX_SIGMA**2
 
@@ -62,7 +62,7 @@ class ImageFit:
     log_determinants: Array
 
     @cached_property
-    def given_way(self) -> tuple[Array, Array]:
+    def free_response(self) -> tuple[Array, Array]:
         """Gradients (K, d) and inverse Hessians (K, d, d) of the energy on the free variables.
 
         Both are 0 for variables that are not free.
@@ -71,7 +71,7 @@ class ImageFit:
         moving = self.free[:, :, None] & self.free[:, None, :]
         return gradient * self.free, self.covariances * moving
 
-    def lasting(self, free: Mask, dt: float) -> Array:
+    def persistent_covariances(self, free: Mask, dt: float) -> Array:
         """Covariances (K, d, d) given one image alone, for errors that persist over images.
 
         Args:
@@ -262,7 +262,9 @@ def step_scale(body: Body) -> Array:
     return np.where(body.skeleton.dof_is_rotation, 0.3, 0.2)
 
 
-def free_covariances(hessians: Array, free: Mask, shares: Array = ALONE) -> tuple[Array, Array]:
+def free_covariances(
+    hessians: Array, free: Mask, shares: Array = WHOLE_SHARE
+) -> tuple[Array, Array]:
     """Inverses (K, d, d) of sums of Hessians on the free variables, and log determinants (K,).
 
     A variable on its limit has the standard deviation `LIMIT_SIGMA`; the maximum is `MAX_SIGMA`.

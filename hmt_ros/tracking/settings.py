@@ -59,13 +59,13 @@ MEASURED_SIGMA = 0.01
 # Standard deviation of the position of a person in a box, as a fraction of the distance. Chosen.
 BOX_SIGMA = 0.15
 # Number of headings from which a pose is fitted. Chosen.
-HEADINGS = 8
+HEADING_COUNT = 8
 # Maximum number of poses at the start of a track. Chosen.
 MAX_STARTS = 96
 # Distance in some joint above which two starts are distinct, m. Chosen.
 START_DISTANCE = 0.03
 # Time in which a person hardly moves, s. Chosen.
-SAME_MOMENT = 0.2
+SAME_MOMENT_TIME = 0.2
 
 # --- Shape of the person
 
@@ -116,7 +116,7 @@ UPRIGHT_CONCENTRATION = 8.0
 # Maximum time for which the last known motion of the camera is extrapolated, s. Chosen.
 MAX_EXTRAPOLATION_TIME = 0.5
 # Fraction that counts as most of an image or of a person.
-MAJORITY = 0.5
+MAJORITY_FRACTION = 0.5
 # Fraction of the usual value at which a silhouette is no evidence; 0 is full evidence of absence,
 # and twice this fraction is full evidence of presence. Chosen.
 UNDECIDED_FRACTION = 0.25
@@ -327,11 +327,11 @@ MAX_CUE_NATS = 3.5
 # front of the trunk. Chosen.
 PLACED_PROBABILITY = 0.8
 # Probability that the evidence of an image for a facing direction is about the person. Chosen.
-FACING_VALID = 0.9
+FACING_VALIDITY = 0.9
 # Largest log odds of a facing direction, nats, also used if a start has only one. Chosen.
 MAX_FACING_NATS = 10.0
 # Least probability of an exchange of sides by a detector. Chosen.
-LEAST_EXCHANGE = 1e-6
+MIN_EXCHANGE_PROBABILITY = 1e-6
 # Largest difference in log weight between the heaviest mode and a likely one, nats. Chosen.
 LIKELY_NATS = 4.0
 # Probability that a person stands on both feet if contact is unknown. Chosen.
@@ -345,7 +345,7 @@ MINIMUM_TOLERANCE = 0.02
 # (3 degrees). Chosen.
 MAX_SIGMA, LIMIT_SIGMA = 2.0, 0.05
 # Number of shape fits to the first image, and number of heaviest modes for the shape. Chosen.
-FIRST_SHAPE_FITS, SHAPE_MODES = 3, 4
+FIRST_SHAPE_FITS, MAX_SHAPE_MODES = 3, 4
 # Largest distance of a person from the prediction, m, and its growth with time, m/s; keypoints
 # further away belong to another person. No clip reaches it.
 BODY_REACH, BODY_SPEED = 0.1, 4.0

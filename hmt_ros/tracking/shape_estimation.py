@@ -88,7 +88,7 @@ class ShapeEstimate:
         gradients: Array,
         covariances: Array,
         *,
-        trust: float,
+        image_share: float,
     ) -> Body:
         """Updates the shape from an image; returns the person's body.
 
@@ -99,7 +99,7 @@ class ShapeEstimate:
             gradients: (K, d) gradients of the energy of image and body prior, with respect to the
                 pose.
             covariances: (K, d, d) inverse Hessians of the same energy, 0 for variables on a limit.
-            trust: share tau with which the image counts.
+            image_share: share tau with which the image counts.
         """
         linear = self.linearised(likelihood, observation, poses)
         size, turns = self._space.size, self._space.body.skeleton.dof_is_rotation
@@ -107,9 +107,9 @@ class ShapeEstimate:
         modes = (np.ascontiguousarray(x) for x in (weights, gradients, covariances))
         if not inform_shape(*linear, *modes, turns, MAX_ANGLE_SHIFT, information, pull):
             raise np.linalg.LinAlgError('the covariance of a mode is singular')
-        self._information += trust * information
-        self._vector += trust * (product(information, self._taken) - pull)
-        self._count += trust
+        self._information += image_share * information
+        self._vector += image_share * (product(information, self._taken) - pull)
+        self._count += image_share
         believed = ERRORS['shape'].together(self._count)
         spread = np.eye(size) + believed * product(self._prior, self._information)
         after = solve(spread, self._prior)
@@ -125,7 +125,7 @@ class ShapeEstimate:
             self._known = None
         return self._space.body
 
-    def considered(
+    def induced_covariances(
         self,
         likelihood: ImageLikelihood,
         observation: Observation,

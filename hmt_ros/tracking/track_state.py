@@ -2,7 +2,7 @@
 
     existence   whether a person is in view                                    `existence`
     validity    whether modes are at the person, and cues show the person      `validity`
-    identity    whether the person in view is the one who was seen last        `SAME_PERSON`
+    identity    whether the person in view is the one who was seen last        `SAME_PERSON_CHAIN`
 
         WAITING or NOBODY  -> (a start)                         ->  TRACKING
         TRACKING           -> (no image locates the person)     ->  LOST
@@ -37,7 +37,7 @@ from hmt_ros.tracking.settings import RATES
 from hmt_ros.tracking.validity import Validity
 
 # Markov chain for the person in view being the one seen last.
-SAME_PERSON = MarkovChain.of_two(*RATES['same person'])
+SAME_PERSON_CHAIN = MarkovChain.of_two(*RATES['same person'])
 
 
 @dataclass
@@ -48,7 +48,8 @@ class TrackState:
         existence: filter of the probability that a person is in view.
         validity: validity of the modes and of the cues.
         ended: whether a track has ended, so that the next person starts another track.
-        met: timestamp of the last image that showed the person, ns; None: no person is known.
+        last_seen_stamp: timestamp of the last image that showed the person, ns; None: no person is
+            known.
         stamp: timestamp of the last image, ns; None: no image yet.
         followed: timestamp of the last image to which the modes were fitted, ns; None: no track.
     """
@@ -56,7 +57,7 @@ class TrackState:
     existence: Existence = field(default_factory=Existence)
     validity: Validity = field(default_factory=Validity)
     ended: bool = False
-    met: int | None = None
+    last_seen_stamp: int | None = None
     stamp: int | None = None
     followed: int | None = None
 
@@ -69,7 +70,7 @@ class TrackState:
     def status(self) -> Status:
         """State of the tracker."""
         if not self.begun:
-            known = self.existence.nobody or self.met is not None
+            known = self.existence.nobody or self.last_seen_stamp is not None
             return Status.NOBODY if self.ended and known else Status.WAITING
         found = self.existence.somebody and not self.validity.lost
         return Status.TRACKING if found else Status.LOST
@@ -77,7 +78,7 @@ class TrackState:
     @property
     def probability(self) -> float:
         """Probability that a person is in view; NaN without any evidence."""
-        known = self.begun or self.existence.told
+        known = self.begun or self.existence.last_evidence
         return self.existence.probability if known else math.nan
 
     @property
@@ -91,9 +92,9 @@ class TrackState:
 
     def is_somebody_else(self, stamp: int) -> bool:
         """Whether a person in view at a timestamp, ns, is probably not the one seen last."""
-        if self.met is None:
+        if self.last_seen_stamp is None:
             return False
-        return bool(SAME_PERSON.closed(1.0, seconds(stamp - self.met)) < 0.5)
+        return bool(SAME_PERSON_CHAIN.closed(1.0, seconds(stamp - self.last_seen_stamp)) < 0.5)
 
     def reason(self, scene: str, misfit: float) -> str:
         """Text that explains why no person is tracked; '' if none is needed.
@@ -104,7 +105,7 @@ class TrackState:
         """
         status, existence = self.status, self.existence
         if status is Status.WAITING:
-            return 'nobody has been seen so far' if existence.told else scene
+            return 'nobody has been seen so far' if existence.last_evidence else scene
         if status is Status.NOBODY and not self.nobody_shown:
             return 'the image shows neither somebody nor that nobody is there'
         if status is not Status.LOST:

@@ -36,16 +36,16 @@ from hmt_ros.inference.error_model import seconds
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.appearance import Appearance
 from hmt_ros.tracking.beginning import (
-    FROM_JOINTS,
-    FROM_SILHOUETTES,
+    JOINT_SOURCES,
+    SILHOUETTE_SOURCES,
     Shown,
     Source,
     first_start,
     poses_to_search,
 )
 from hmt_ros.tracking.camera_motion import CameraPath
-from hmt_ros.tracking.existence import GIVEN, Existence
-from hmt_ros.tracking.filter import Judged, MixtureFilter
+from hmt_ros.tracking.existence import GIVEN_PROBABILITY, Existence
+from hmt_ros.tracking.filter import CueMisfits, MixtureFilter
 from hmt_ros.tracking.ground import (
     GroundEstimator,
     KnownGround,
@@ -201,7 +201,7 @@ class Tracker:
         given = View(image, stamp, keypoints, prediction, mask, predicted, others, depth)
         self._observer.check(given, self._track.body, self._state.stamp)
         view, observation = self._observe(given), None
-        self._believe(view)
+        self._update_existence(view)
         if not self._state.begun:
             observation = self._start(view)
         elif self._state.existence.nobody:
@@ -258,7 +258,7 @@ class Tracker:
         if newer is not None and newer.up is not None:
             self._ground.set_gravity(newer.up, newer.camera_height, newer.up_sigma)
         if pose is not None:
-            self.silhouettes.see_from(pose, self.camera)
+            self.silhouettes.set_camera_pose(pose, self.camera)
 
     def _observe(self, given: View) -> View:
         """Updates ground and scene from an image, and returns the view of a person in it."""
@@ -266,10 +266,10 @@ class Tracker:
         self._track.spent.clear()
         self._move_camera(given.stamp)
         if self.settings.ground.on:
-            ground.look(given.image, self.camera, given.stamp)
+            ground.update_by_lines(given.image, self.camera, given.stamp)
             upside_down = ground.reversed
             if given.keypoints is not None:
-                ground.see(given.keypoints)
+                ground.update_sign_by_keypoints(given.keypoints)
             if upside_down != ground.reversed and self._state.begun:
                 self._drop_track(self._state)
         before = self._track.body
@@ -290,7 +290,7 @@ class Tracker:
         doubted = silhouettes.doubted
         dt = self._state.age(given.stamp)
         view = self._observer.view(given, self._track.person, near, dt)
-        ghost = not self._state.begun or self._started_from in FROM_SILHOUETTES
+        ghost = not self._state.begun or self._started_from in SILHOUETTE_SOURCES
         if silhouettes.doubted > doubted and ghost:
             # The track may have followed a ghost: an error of the background.
             self._drop_track(TrackState(stamp=self._state.stamp))
@@ -313,22 +313,22 @@ class Tracker:
 
     # Believe.
 
-    def _believe(self, view: View) -> None:
+    def _update_existence(self, view: View) -> None:
         """Updates the beliefs that a person is in view, and that it is still the same person."""
         if self._state.is_somebody_else(view.stamp):
             # Nothing is known about the next person.
             self._landmarks = LandmarkOffsets()
-            self._drop_track(replace(self._state, ended=True, met=None), self.model)
+            self._drop_track(replace(self._state, ended=True, last_seen_stamp=None), self.model)
         state = self._state
         if not (state.begun or state.ended or view.mask is not None):
             # The background may still be learning, so its silhouettes cannot start a track.
             view = view._replace(anywhere=None, silhouette=None)
-        state.existence.look(view, self._track.person, waiting=not state.begun)
+        state.existence.update(view, self._track.person, waiting=not state.begun)
 
-    def _judge(self, judged: Judged, depths: ImageMap | None, dt: float) -> None:
+    def _update_validity(self, misfits: CueMisfits, depths: ImageMap | None, dt: float) -> None:
         """Updates the validity of modes and cues from an image, dt s after the previous one."""
         validity, track = self._state.validity, self._track
-        validity.update(judged.misfits, dt, judged.alone)
+        validity.update(misfits.by_cue, dt, misfits.alone)
         if depths is not None:
             pose = track.modes.poses[0]
             validity.update_depths(of_depth_at_best(track.body, self.camera, pose, depths), dt)
@@ -348,11 +348,11 @@ class Tracker:
         state.validity.predict(dt)
         believed = replace(observation, beliefs=state.validity.beliefs)
         if poses is None:
-            judged = track.propagate(believed, dt, view.prediction)
+            misfits = track.propagate(believed, dt, view.prediction)
         else:
             state.validity.search()
-            judged, dt = track.begin_anew(poses, observation), np.inf
-        self._judge(judged, observation.depths, dt)
+            misfits, dt = track.restart(poses, observation), np.inf
+        self._update_validity(misfits, observation.depths, dt)
         return believed
 
     def _search(self, observation: Observation, prediction: PosePrediction | None) -> Array | None:
@@ -388,7 +388,7 @@ class Tracker:
         Args:
             view: view of the image.
             somebody: whether the existence filter reports a person; if not, the start resets it to
-                `GIVEN`.
+                `GIVEN_PROBABILITY`.
         """
         masked, existence, silhouettes = (
             view.mask is not None,
@@ -407,13 +407,13 @@ class Tracker:
         found = first_start(shown, existence)
         if found is None:
             if self._given is not None or existence.last.llr <= 0.0:
-                said = existence.last.said.get('detector', 0.0)
+                said = existence.last.log_ratios.get('detector', 0.0)
                 if masked and view.silhouette is not None:
                     said = 1.0 if view.silhouette.any() else -1.0
                 silhouettes.learn(view.image, view.stamp, said > 0.0 if said else None)
             return None
         source, start = found
-        if source in FROM_JOINTS:
+        if source in JOINT_SOURCES:
             if not masked:
                 silhouettes.check(view.image, start.body, self.camera, start.best)
             if silhouettes.doubted:
@@ -424,19 +424,19 @@ class Tracker:
         for _ in range(2):
             observation = self._observer.observation(view, start.best[0], self._state.validity)
             self._begin(observation, source, start)
-            if self._state.validity.believes(SILHOUETTE):
+            if self._state.validity.is_trusted(SILHOUETTE):
                 break
             # The silhouette contradicts the start. The start is trusted: repeat without silhouette.
         if not somebody:
-            self._state.existence = Existence(GIVEN)
-            self._meet(view)
-            self._state.existence.look(view, self._track.person)
+            self._state.existence = Existence(GIVEN_PROBABILITY)
+            self._learn_appearance(view)
+            self._state.existence.update(view, self._track.person)
         return observation
 
     def _begin(self, observation: Observation, source: Source, start: Start) -> None:
         """Starts the modes of a track."""
         self._started_from = source
-        self._judge(self._track.begin(start, observation), observation.depths, np.inf)
+        self._update_validity(self._track.begin(start, observation), observation.depths, np.inf)
 
     def _new_track(self, body: Body) -> MixtureFilter:
         return MixtureFilter(
@@ -453,9 +453,9 @@ class Tracker:
 
     # Learn and publish.
 
-    def _meet(self, view: View) -> None:
+    def _learn_appearance(self, view: View) -> None:
         """Learns the appearance of the person from an image."""
-        self._state.met = view.stamp
+        self._state.last_seen_stamp = view.stamp
         self._state.existence.appearance.learn(
             view, view.stamp, self._track.person, self.camera, self._track.modes.poses[0]
         )
@@ -464,7 +464,7 @@ class Tracker:
         """Updates background, ground, appearance and landmarks from the modes of an image."""
         state, track, modes = self._state, self._track, self._track.modes
         shown = {KEYPOINTS: view.keypoints is not None, DEPTH: view.depth is not None}
-        told = any(shown[cue] and state.validity.believes(cue) for cue in shown)
+        told = any(shown[cue] and state.validity.is_trusted(cue) for cue in shown)
         if view.mask is None and told and not state.validity.lost:
             # A cue other than the silhouette locates the person.
             likely = modes.poses[modes.log_weights > -LIKELY_NATS]
@@ -475,7 +475,7 @@ class Tracker:
         age = state.age(view.stamp)
         self._observer.last_image, state.followed = view.image, view.stamp
         if state.existence.last.seen:
-            self._meet(view)
+            self._learn_appearance(view)
         if view.keypoints is not None and image_counts and not state.validity.lost:
             self._landmarks = self._landmarks.after(
                 view.keypoints, track.person, self.camera, modes.poses[0], age

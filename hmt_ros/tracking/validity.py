@@ -57,12 +57,12 @@ from hmt_ros.tracking.settings import (
     VALIDITY_NATS,
 )
 
-CHAIN = MarkovChain.of_two(*RATES['track and cues'])
+VALIDITY_CHAIN = MarkovChain.of_two(*RATES['track and cues'])
 
 DEPTH = 'depth'
 # Misfit u at which the evidence about a cue is zero. Clothes in the colours of the room leave holes
 # in a silhouette.
-UNDECIDED = {SILHOUETTE: 0.4, OUTLINE: 0.4, KEYPOINTS: 0.25, DEPTH: 0.15}
+UNDECIDED_MISFITS = {SILHOUETTE: 0.4, OUTLINE: 0.4, KEYPOINTS: 0.25, DEPTH: 0.15}
 # Axes of the joint probability: the track, the detector of keypoints, and the cues.
 TRACK, DETECTOR = range(2)
 AXES = {SILHOUETTE: slice(2, 3), KEYPOINTS: slice(3, 3 + EXCHANGED.shape[1])}
@@ -75,7 +75,7 @@ AXIS_RATES = np.tile(RATES['track and cues'], (CHAINS, 1))
 AXIS_RATES[DETECTOR] = RATES['detector']
 VALID = STATES.astype(np.float64)
 VALID[:, AXES[KEYPOINTS]] *= STATES[:, [DETECTOR]]
-WITHOUT_SILHOUETTE = (VALID[:, AXES[SILHOUETTE]] == 0).all(1)
+STATES_WITHOUT_SILHOUETTE = (VALID[:, AXES[SILHOUETTE]] == 0).all(1)
 
 
 class ByKeypoints(NamedTuple):
@@ -101,7 +101,7 @@ class Validity:
     def __init__(self) -> None:
         usual = np.array([MarkovChain.of_two(*rates).usual for rates in AXIS_RATES])
         self._take(usual[np.arange(CHAINS), STATES].prod(1))
-        self._depth = CHAIN.usual
+        self._depth = VALIDITY_CHAIN.usual
 
     def _take(self, joint: Array) -> None:
         self.joint = joint
@@ -120,7 +120,7 @@ class Validity:
         """
         return {name: self._chains[axes] for name, axes in AXES.items()} | {DEPTH: self._depth[1:]}
 
-    def believes(self, cue: str) -> bool:
+    def is_trusted(self, cue: str) -> bool:
         """Whether a cue more likely than not shows the person; a lost track uses all cues."""
         return self.lost or bool(self.cues[cue].max() >= 0.5)
 
@@ -155,7 +155,7 @@ class Validity:
 
     def predict(self, dt: float) -> None:
         """Predicts the probabilities dt seconds ahead, equation (1)."""
-        self._depth = CHAIN.predict(self._depth, dt)
+        self._depth = VALIDITY_CHAIN.predict(self._depth, dt)
         joint = self.joint.copy()
         step_chains(AXIS_RATES, dt, joint)
         self._take(joint)
@@ -163,7 +163,7 @@ class Validity:
     def search(self) -> None:
         """Resets the probability of the track when its modes restart."""
         of_cues = self.joint.reshape(2, -1).sum(TRACK)
-        self._take(np.multiply.outer(CHAIN.usual, of_cues).ravel())
+        self._take(np.multiply.outer(VALIDITY_CHAIN.usual, of_cues).ravel())
 
     def update(
         self, misfits: Mapping[str, Misfit], dt: float, alone: ByKeypoints | None = None
@@ -212,7 +212,7 @@ def _divided(of_track: Array, share: float, alone: ByKeypoints) -> Array:
     at_modes = product(VALID, own)
     own[AXES[KEYPOINTS]] = np.minimum(share * evidence_of(KEYPOINTS, alone.keypoints), 0.0)
     by_keypoints = product(VALID, own) + alone.gain
-    return np.asarray(np.where(WITHOUT_SILHOUETTE, by_keypoints, at_modes), dtype=np.float64)
+    return np.asarray(np.where(STATES_WITHOUT_SILHOUETTE, by_keypoints, at_modes), dtype=np.float64)
 
 
 def evidence_of(cue: str, misfit: Misfit, *, begun: bool = True) -> Array:
@@ -224,7 +224,7 @@ def evidence_of(cue: str, misfit: Misfit, *, begun: bool = True) -> Array:
         begun: whether the track started before this image.
     """
     certainty = np.minimum(misfit.counts / VALIDITY_COUNT, 1.0)
-    e = np.asarray(VALIDITY_NATS * certainty * (UNDECIDED[cue] - misfit.shares))
+    e = np.asarray(VALIDITY_NATS * certainty * (UNDECIDED_MISFITS[cue] - misfit.shares))
     if cue != KEYPOINTS or not begun:
         return e
     return _mixed(PLACED_PROBABILITY, e) - _mixed(1.0 - PLACED_PROBABILITY, e)

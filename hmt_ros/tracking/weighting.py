@@ -47,7 +47,7 @@ class Transition(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Continuity:
+class TransitionPrior:
     """Transition densities from the modes of an image to hypotheses of the next image.
 
     Attributes:
@@ -77,7 +77,7 @@ class Continuity:
         rate_transitions(self.joints, joints, self._transition, result)
         return result
 
-    def rated(self, joints: Array) -> Array:
+    def log_predictive(self, joints: Array) -> Array:
         """Log predictive density log sum_k w_k t(x_n, x_k), (N,), for joints (N, J, 3)."""
         rates = self.log_weights[:, None] + self.log_transitions(joints)
         return np.asarray(log_sum_exp(rates, axis=0), dtype=np.float64)

@@ -17,7 +17,7 @@ VERSION = 9
 MAX_BYTES = 2**19
 
 # Infinite duration as rmw writes it, for no deadline and no lifespan.
-_INFINITE = {'sec': 9223372036, 'nsec': 854775807}
+_INFINITE_DURATION = {'sec': 9223372036, 'nsec': 854775807}
 
 
 class BagError(ValueError):
@@ -84,10 +84,10 @@ def quality_of_service(latched: bool) -> list[dict[str, Any]]:
             'depth': 1 if latched else 10,
             'reliability': 'reliable',
             'durability': 'transient_local' if latched else 'volatile',
-            'deadline': dict(_INFINITE),
-            'lifespan': dict(_INFINITE),
+            'deadline': dict(_INFINITE_DURATION),
+            'lifespan': dict(_INFINITE_DURATION),
             'liveliness': 'automatic',
-            'liveliness_lease_duration': dict(_INFINITE),
+            'liveliness_lease_duration': dict(_INFINITE_DURATION),
             'avoid_ros_namespace_conventions': False,
         }
     ]

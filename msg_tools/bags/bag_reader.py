@@ -36,7 +36,13 @@ from msg_tools.bags.mcap_file import MAGIC as _MCAP_MAGIC
 from msg_tools.bags.mcap_file import McapFile
 from msg_tools.bags.sqlite_file import MAGIC as _SQLITE_MAGIC
 from msg_tools.bags.sqlite_file import SqliteFile
-from msg_tools.bags.storage import LARGEST, MAX_TOPICS, Channel, StoredMessage, faults_told
+from msg_tools.bags.storage import (
+    MAX_CHUNK_BYTES,
+    MAX_TOPICS,
+    Channel,
+    StoredMessage,
+    as_bag_errors,
+)
 from msg_tools.files.budget import Budget, BudgetError
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.message_types import adopted, typestore_of_definition
@@ -47,10 +53,10 @@ Content = TypeVar('Content')
 
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
-_OURS = 'hmt_msgs/'
+_OWN_PREFIX = 'hmt_msgs/'
 # Maximum number of message definitions per topic, and of names in an error message.
-_MOST_DEFINITIONS, _MOST_NAMES = 4, 20
-_PIECE = 2**20
+_MAX_DEFINITIONS, _MAX_NAMES = 4, 20
+_PIECE_BYTES = 2**20
 
 
 @dataclass(frozen=True)
@@ -165,7 +171,7 @@ class BagReader(AbstractContextManager['BagReader']):
                 )
         self.cut_off = tuple(file.name for file in self._files if file.cut_off)
         for name in self.cut_off:
-            _tell_cut_off(name)
+            _warn_of_cut_off(name)
 
     def close(self) -> None:
         """Removes the temporary files with decompressed content."""
@@ -259,9 +265,9 @@ class BagReader(AbstractContextManager['BagReader']):
             if len(kinds) > 1:
                 raise BagError(
                     f'{self.path}: topic {name} has messages of several kinds: '
-                    f'{" and ".join(sorted(kinds)[:_MOST_NAMES])}'
+                    f'{" and ".join(sorted(kinds)[:_MAX_NAMES])}'
                 )
-            if len(channels) > _MOST_DEFINITIONS:
+            if len(channels) > _MAX_DEFINITIONS:
                 raise BagError(f'{self.path}: topic {name} has {len(channels)} definitions')
             self._check_encoding(name, self.topics[name].encoding)
         return self._merged(names)
@@ -294,9 +300,9 @@ class BagReader(AbstractContextManager['BagReader']):
                 )
             # A bag can compress each message; no CDR message starts with these bytes.
             if data[:4] == _ZSTD_MAGIC:
-                data = b''.join(_decompressed(data, budget, LARGEST))
+                data = b''.join(_decompressed(data, budget, MAX_CHUNK_BYTES))
             message = deserialise(data, stored.msgtype, store, budget)
-            return adopted(message, store) if stored.msgtype.startswith(_OURS) else message
+            return adopted(message, store) if stored.msgtype.startswith(_OWN_PREFIX) else message
         except Exception as error:
             # Generated code reads untrusted bytes here, and its exceptions are not documented.
             raise BagError(
@@ -332,7 +338,7 @@ class BagReader(AbstractContextManager['BagReader']):
 
     def _open_file(self, path: Path, budget: Budget) -> McapFile | SqliteFile:
         name = str(path)
-        with faults_told(name):
+        with as_bag_errors(name):
             magic = _first_bytes(path)
             if magic.startswith(_ZSTD_MAGIC):
                 path = self._decompressed(path, budget)
@@ -359,7 +365,7 @@ class BagReader(AbstractContextManager['BagReader']):
 
 
 @cache
-def _tell_cut_off(name: str) -> None:
+def _warn_of_cut_off(name: str) -> None:
     """Logs a warning once per file, because a command opens a bag several times."""
     _log.warning(
         '%s breaks off: it is read up to its last complete message; `mcap recover` repairs the '
@@ -383,7 +389,7 @@ def _decompressed(packed: bytes | BinaryIO, budget: Budget, largest: int) -> Ite
         BudgetError: the content exceeds this size or the budget.
     """
     with zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True) as stream:
-        while piece := stream.read(_PIECE):
+        while piece := stream.read(_PIECE_BYTES):
             budget.spend(unpacked=len(piece))
             largest -= len(piece)
             if largest < 0:
@@ -393,8 +399,8 @@ def _decompressed(packed: bytes | BinaryIO, budget: Budget, largest: int) -> Ite
 
 def _listed(names: Collection[str]) -> str:
     """Names as text for an error message."""
-    more = f' and {len(names) - _MOST_NAMES} more' if len(names) > _MOST_NAMES else ''
-    return ', '.join(islice(names, _MOST_NAMES)) + more
+    more = f' and {len(names) - _MAX_NAMES} more' if len(names) > _MAX_NAMES else ''
+    return ', '.join(islice(names, _MAX_NAMES)) + more
 
 
 def _from_its_start(

@@ -33,7 +33,7 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import ChunkIndex, Schema, Statistics
 from mcap.stream_reader import StreamReader
 
-from msg_tools.bags.storage import LARGEST, NEVER, Channel, StoredMessage, faults_told
+from msg_tools.bags.storage import MAX_CHUNK_BYTES, NEVER_NS, Channel, StoredMessage, as_bag_errors
 from msg_tools.files.budget import Budget, BudgetError
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -48,8 +48,8 @@ _DESCRIPTIONS: dict[int, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: ChannelR
 # Maximum size, bytes, of a summary, of a schema or channel, of a run of records outside of chunks,
 # and of all open chunks together; then bytes of memory per byte of a schema or channel.
 _MAX_SUMMARY, _MAX_DESCRIPTION, _MAX_RUN, _MAX_OPEN = 2**25, 2**20, 2**20, 2**28 + 2**27
-_MEMORY = 16
-_SKIPPED = 8  # cost of a skipped record in the budget, in records
+_MEMORY_PER_BYTE = 16
+_RECORDS_PER_SKIPPED = 8  # cost of a skipped record in the budget, in records
 
 
 @dataclass
@@ -73,7 +73,7 @@ class _Index:
     def add(self, file: _File, offset: int, end: int, *, bare: bool) -> None:
         """Adds a chunk, or records outside of chunks, between two offsets of the file."""
         counts: Counter[int] = Counter()
-        start, whole = NEVER, 0
+        start, whole = NEVER_NS, 0
         data = file.content(offset, end)
         try:
             for opcode, place, stop in file.records(data):
@@ -82,7 +82,7 @@ class _Index:
                     counts[key] += 1
                     start = min(start, time)
                 elif opcode in _DESCRIPTIONS:
-                    file.budget.spend(unpacked=_MEMORY * (stop - place))
+                    file.budget.spend(unpacked=_MEMORY_PER_BYTE * (stop - place))
                     if stop - place > _MAX_DESCRIPTION:
                         raise McapError(f'a schema or channel of {stop - place} bytes')
                     kind = _DESCRIPTIONS[opcode]
@@ -114,13 +114,13 @@ class McapFile:
 
     Attributes:
         counts: number of messages of each channel.
-        start: lower bound of the log time of the first message, ns; `NEVER` without messages.
+        start: lower bound of the log time of the first message, ns; `NEVER_NS` without messages.
         cut_off: whether the end of the file is missing.
     """
 
     def __init__(self, path: Path, name: str, budget: Budget) -> None:
         self._path, self.name = path, name
-        with faults_told(name), path.open('rb') as opened:
+        with as_bag_errors(name), path.open('rb') as opened:
             file = _File(opened, budget)
             index = None
             with suppress(Exception):  # a pass over the file finds the fault
@@ -128,7 +128,7 @@ class McapFile:
             self._index = index or _index_of_a_pass(file)
         index = self._index
         self.cut_off = isinstance(index.fault, EndOfFile)
-        self.start = min((x.message_start_time for x in index.chunks), default=NEVER)
+        self.start = min((x.message_start_time for x in index.chunks), default=NEVER_NS)
         definitions = {
             key: each.data.decode('utf-8', 'replace') for key, each in index.schemas.items()
         }
@@ -154,7 +154,7 @@ class McapFile:
                 the budget.
         """
         wanted = {key for key, channel in self._channels.items() if channel.topic in topics}
-        with faults_told(self.name), self._path.open('rb') as opened:
+        with as_bag_errors(self.name), self._path.open('rb') as opened:
             file = _File(opened, budget)
             chunks = [
                 file.messages(chunk, self._channels, wanted)
@@ -202,7 +202,7 @@ class _File:
 
     def content(self, offset: int, end: int) -> bytes | memoryview:
         """Decompressed chunk, or records outside of chunks, between two offsets of the file."""
-        if end - offset > LARGEST + _MAX_RUN:
+        if end - offset > MAX_CHUNK_BYTES + _MAX_RUN:
             raise McapError(f'a record of {end - offset} bytes')
         record = memoryview(self.read(offset, end))
         if record[0] != Opcode.CHUNK:
@@ -213,7 +213,7 @@ class _File:
         compression = bytes(record[at + 4 : at + 4 + length])
         (length,) = struct.unpack_from('<Q', record, at + 4 + len(compression))
         packed = record[at + 12 + len(compression) :][:length]
-        if len(packed) < length or size > LARGEST:
+        if len(packed) < length or size > MAX_CHUNK_BYTES:
             raise McapError(f'a chunk of {length} bytes for {size}')
         if not compression:
             data: bytes | memoryview = packed
@@ -327,7 +327,7 @@ def _pieces(file: _File) -> Iterator[tuple[int, int, bool]]:
             if end > file.size:
                 raise EndOfFile(f'{end - file.size} bytes are missing after {file.size}')
             bare = opcode == Opcode.MESSAGE or opcode in _DESCRIPTIONS
-            file.budget.spend(records=0 if bare else _SKIPPED)
+            file.budget.spend(records=0 if bare else _RECORDS_PER_SKIPPED)
             if run < at and (not bare or end - run > _MAX_RUN):
                 yield run, at, True
                 run = at

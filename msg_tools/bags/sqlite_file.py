@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from msg_tools.bags.storage import (
-    LARGEST,
+    MAX_CHUNK_BYTES,
     MAX_TOPICS,
-    NEVER,
+    NEVER_NS,
     Channel,
     StoredMessage,
-    faults_told,
+    as_bag_errors,
 )
 from msg_tools.files.budget import Budget, BudgetError
 from msg_tools.messages.definitions import MAX_BYTES
@@ -45,8 +45,8 @@ class SqliteFile:
         self._path, self.name = path, name
         self._channels: dict[int, Channel] = {}
         self.counts: Counter[Channel] = Counter()
-        self.start = NEVER
-        with faults_told(name), _connected(path) as database:
+        self.start = NEVER_NS
+        with as_bag_errors(name), _connected(path) as database:
             # SQLite resolves all views to describe one table, in time exponential in their number.
             if _mentions(database, 'view') or _mentions(database, 'virtual'):
                 raise sqlite3.DataError('it has views or virtual tables, wanted tables')
@@ -77,10 +77,11 @@ class SqliteFile:
         """See `McapFile.messages`."""
         wanted = [str(key) for key, channel in self._channels.items() if channel.topic in topics]
         query = (
-            f'SELECT topic_id, timestamp, CASE WHEN length(data) <= {LARGEST} THEN data END '
+            'SELECT topic_id, timestamp, '
+            f'CASE WHEN length(data) <= {MAX_CHUNK_BYTES} THEN data END '
             f'FROM messages WHERE topic_id IN ({", ".join(wanted)}) ORDER BY timestamp, id'
         )
-        with faults_told(self.name), _connected(self._path) as database:
+        with as_bag_errors(self.name), _connected(self._path) as database:
             for key, time, data in _rows(database, query, (int, int, bytes), budget):
                 budget.spend(unpacked=len(data))
                 if time < 0:

@@ -10,8 +10,8 @@ from msg_tools.bags.bag_metadata import BagError, reason
 from msg_tools.files.budget import BudgetError
 
 # Maximum size of a message or a chunk, bytes; the largest accepted images have 2**26 pixels.
-LARGEST = 2**28
-NEVER = 2**64  # later than any log time
+MAX_CHUNK_BYTES = 2**28
+NEVER_NS = 2**64  # later than any log time
 MAX_TOPICS = 2**16  # maximum number of topics, summed over the files of a bag; the limit of MCAP
 
 
@@ -42,7 +42,7 @@ class StoredMessage(NamedTuple):
 
 
 @contextmanager
-def faults_told(name: str) -> Iterator[None]:
+def as_bag_errors(name: str) -> Iterator[None]:
     """Turns any exception into a BagError, because libraries do not document their exceptions."""
     try:
         yield

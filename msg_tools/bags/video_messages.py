@@ -21,7 +21,7 @@ from msg_tools.messages.message_types import RosbagsMessages
 
 VIDEO_TYPE = 'foxglove_msgs/msg/CompressedVideo'
 _TYPES = ('sensor_msgs/msg/CompressedImage', VIDEO_TYPE)
-_MOST_WAITING = 32  # maximum number of packets that are not decoded yet
+_MAX_WAITING_PACKETS = 32  # maximum number of packets that are not decoded yet
 # Name of the decoder by the format in a message.
 _CODECS = {'h264': 'h264', 'h265': 'hevc', 'hevc': 'hevc', 'vp9': 'vp9', 'av1': 'av1'}
 
@@ -106,7 +106,7 @@ class _Video:
             packet = self._av.Packet(np.asarray(stored.message.data, dtype=np.uint8).tobytes())
             packet.pts = self.count
             self._packets[self.count] = stored
-            self._packets.pop(self.count - _MOST_WAITING, None)
+            self._packets.pop(self.count - _MAX_WAITING_PACKETS, None)
             self.count += 1
         try:
             frames = self._decoder.decode(packet)

@@ -24,17 +24,17 @@ from msg_tools.files.budget import Budget
 from msg_tools.files.error_line import error_line
 
 # Maximum total size of the arrays of an archive, bytes.
-LARGEST_ARCHIVE = 2**29
-_MOST_ARRAYS = 10_000
+MAX_ARCHIVE_BYTES = 2**29
+_MAX_ARRAYS = 10_000
 _KINDS = 'biufSU'
-_SMALLEST = 4  # minimum counted size of a number, bytes
-_LONGEST = 10**6  # maximum length of an axis of an array without data
-_HEADS = {
+_MIN_VALUE_BYTES = 4  # minimum counted size of a number, bytes
+_MAX_EMPTY_SIDE = 10**6  # maximum length of an axis of an array without data
+_HEADER_READERS = {
     (1, 0): array_format.read_array_header_1_0,
     (2, 0): array_format.read_array_header_2_0,
 }
 # Exceptions from damaged archives, in addition to OSError and ValueError.
-_FAULTS = (
+_ARCHIVE_ERRORS = (
     zipfile.BadZipFile,
     zipfile.LargeZipFile,
     zlib.error,
@@ -52,7 +52,7 @@ _FAULTS = (
 )
 
 
-def read_archive(path: str | Path, largest: int = LARGEST_ARCHIVE) -> dict[str, NDArray[Any]]:
+def read_archive(path: str | Path, largest: int = MAX_ARCHIVE_BYTES) -> dict[str, NDArray[Any]]:
     """Reads the arrays of an archive, by name.
 
     Args:
@@ -67,9 +67,9 @@ def read_archive(path: str | Path, largest: int = LARGEST_ARCHIVE) -> dict[str, 
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
             members = archive.infolist()
             total = sum(member.file_size for member in members)
-            if total > largest or len(members) > _MOST_ARRAYS:
+            if total > largest or len(members) > _MAX_ARRAYS:
                 raise ValueError(
-                    f'its {len(members)} arrays have {total} bytes, wanted at most {_MOST_ARRAYS} '
+                    f'its {len(members)} arrays have {total} bytes, wanted at most {_MAX_ARRAYS} '
                     f'arrays and {largest} bytes'
                 )
             Budget(os.fstat(file.fileno()).st_size).spend(unpacked=total)
@@ -77,7 +77,7 @@ def read_archive(path: str | Path, largest: int = LARGEST_ARCHIVE) -> dict[str, 
                 member.filename.removesuffix('.npy'): _array(archive, member, largest)
                 for member in members
             }
-    except (ValueError, *_FAULTS) as fault:
+    except (ValueError, *_ARCHIVE_ERRORS) as fault:
         raise ValueError(error_line(fault)) from fault
 
 
@@ -85,17 +85,17 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, largest: int) -> N
     """Reads an array of an archive; its header is first compared with its number of bytes."""
     name, there = member.filename, member.file_size
     with archive.open(member) as file:
-        read_head = _HEADS.get(array_format.read_magic(file))
+        read_head = _HEADER_READERS.get(array_format.read_magic(file))
         if read_head is None:
             raise ValueError(f'the array {name} has an unknown version')
         shape, _, dtype = read_head(file)
         if dtype.kind not in _KINDS:
             raise ValueError(f'the array {name} holds {str(dtype)[:40]}, wanted numbers or texts')
         # Callers convert numbers of one byte to larger types.
-        claimed = math.prod(shape) * max(dtype.itemsize, _SMALLEST)
+        claimed = math.prod(shape) * max(dtype.itemsize, _MIN_VALUE_BYTES)
         if math.prod(shape) * dtype.itemsize > there or claimed > largest:
             raise ValueError(f'the array {name} claims {claimed} bytes, but has {there}')
-        if max(shape, default=0) > max(there, _LONGEST):
+        if max(shape, default=0) > max(there, _MAX_EMPTY_SIDE):
             raise ValueError(f'the array {name} has shape {str(shape)[:40]}, but {there} bytes')
         file.seek(0)
         return np.asarray(array_format.read_array(file, allow_pickle=False))

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from msg_tools.files.mp4_boxes import boxes_at, mapped
 
 # Identity matrix, and matrices of clockwise rotations by angle, degrees.
-STORED = 1, 0, 0, 1
-TURNED = {0: STORED, 90: (0, 1, -1, 0), 180: (-1, 0, 0, -1), 270: (0, -1, 1, 0)}
+IDENTITY = 1, 0, 0, 1
+ROTATIONS = {0: IDENTITY, 90: (0, 1, -1, 0), 180: (-1, 0, 0, -1), 270: (0, -1, 1, 0)}
 
 Matrix = tuple[int, int, int, int]
 
-_MATRIX_AT = 40, 52  # offset in versions 0 and 1 of the box, bytes
+_MATRIX_OFFSETS = 40, 52  # offset in versions 0 and 1 of the box, bytes
 
 
 def display_matrix(path: Path) -> Matrix | None:
@@ -34,7 +34,7 @@ def display_matrix(path: Path) -> Matrix | None:
             if b'vide' not in [data[at + 8 : at + 12] for at, _ in handlers]:
                 continue
             for at, last in boxes_at(data, start, end, b'tkhd'):
-                at += _MATRIX_AT[data[at : at + 1] == b'\x01']
+                at += _MATRIX_OFFSETS[data[at : at + 1] == b'\x01']
                 if at + 20 <= last:
                     a, b, _, c, d = struct.unpack_from('>5i', data, at)
                     return (a, b, c, d) if a * d != b * c else None

@@ -7,20 +7,20 @@ characters, and characters that reverse the direction of text, have no width, or
 from __future__ import annotations
 
 # Maximum length of a line, and of a text that is a part of a line, characters.
-LONGEST_LINE, LONGEST_TEXT = 300, 250
+MAX_LINE, MAX_TEXT = 300, 250
 
 
-def one_line(text: str, most: int = LONGEST_TEXT) -> str:
+def one_line(text: str, most: int = MAX_TEXT) -> str:
     """A text without breaks and control characters, of at most `most` characters."""
     return printable(' '.join(_shortened(text, 100 * most).split()), most)
 
 
-def error_line(error: BaseException, most: int = LONGEST_TEXT) -> str:
+def error_line(error: BaseException, most: int = MAX_TEXT) -> str:
     """The text of an error as one line; the name of its type if the text is empty."""
     return one_line(str(error), most) or type(error).__name__
 
 
-def printable(text: str, most: int = LONGEST_LINE) -> str:
+def printable(text: str, most: int = MAX_LINE) -> str:
     """A line with escapes for unprintable characters, shortened if needed."""
     shown = (x if x.isprintable() else ascii(x)[1:-1] for x in _shortened(text, most))
     return _shortened(''.join(shown), most)

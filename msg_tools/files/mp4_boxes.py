@@ -14,7 +14,7 @@ from msg_tools.files.bounded_file import open_regular
 
 Data: TypeAlias = 'bytes | mmap.mmap'
 
-_MOST = 300_000  # maximum number of boxes in a box; videos of hours have up to two per image
+_MAX_BOXES = 300_000  # maximum number of boxes in a box; videos of hours have up to two per image
 
 
 @contextmanager
@@ -37,7 +37,7 @@ def boxes(data: Data, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
 
     A damaged box and all later boxes are left out.
     """
-    for _ in range(_MOST):
+    for _ in range(_MAX_BOXES):
         if start + 8 > end:
             return
         size, kind = struct.unpack_from('>I4s', data, start)

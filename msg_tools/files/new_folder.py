@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 _log = logging.getLogger(__name__)
-_REPLACED, _PARTIAL = 'replaced', '.partial'
+_REPLACED_SUFFIX, _PARTIAL_SUFFIX = 'replaced', '.partial'
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class FolderKind:
         missing = [folder for folder in target.parents if not folder.exists()]
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
-            with _made_aside(target, (self.marker, *self.own)) as new:
+            with _replacement(target, (self.marker, *self.own)) as new:
                 yield new
                 self.check_place(target, overwrite=overwrite)
         finally:
@@ -104,21 +104,23 @@ def new_file(target: Path) -> Iterator[BinaryIO]:
     """
     target = target.absolute()
     check_file_place(target, overwrite=True)
-    with _made_aside(target, (glob.escape(target.name),)) as new, new.open('xb') as file:
+    with _replacement(target, (glob.escape(target.name),)) as new, new.open('xb') as file:
         yield file
         file.flush()
         os.fsync(file.fileno())
 
 
 @contextmanager
-def _made_aside(target: Path, own: Sequence[str]) -> Iterator[Path]:
+def _replacement(target: Path, own: Sequence[str]) -> Iterator[Path]:
     """Yields a temporary path for a file or folder, which replaces the target at the end.
 
     Args:
         own: patterns for the names of the files that this write makes.
     """
-    around = Path(tempfile.mkdtemp(prefix=f'.{target.name}.', suffix=_PARTIAL, dir=target.parent))
-    replaced = around / _REPLACED
+    around = Path(
+        tempfile.mkdtemp(prefix=f'.{target.name}.', suffix=_PARTIAL_SUFFIX, dir=target.parent)
+    )
+    replaced = around / _REPLACED_SUFFIX
     try:
         with locked(around):
             yield around / target.name
@@ -156,7 +158,7 @@ def locked(folder: Path) -> Iterator[bool | None]:
 
 def _remove_remains(target: Path, own: Sequence[str]) -> None:
     """Removes and logs hidden folders that killed processes have left beside the target."""
-    hidden = re.compile(rf'\.{re.escape(target.name)}\.[a-z0-9_]{{8}}{re.escape(_PARTIAL)}')
+    hidden = re.compile(rf'\.{re.escape(target.name)}\.[a-z0-9_]{{8}}{re.escape(_PARTIAL_SUFFIX)}')
     with suppress(OSError):
         for path in sorted(target.parent.iterdir()):
             if hidden.fullmatch(path.name) and path.is_dir() and not path.is_symlink():
@@ -170,7 +172,7 @@ def _holds_only(folder: Path, name: str, own: Sequence[str]) -> bool:
     """Whether a hidden folder contains only files of an unfinished write."""
     return all(
         not _foreign(files, own)
-        and not _foreign(folders, (glob.escape(name), _REPLACED, f'*{_PARTIAL}'))
+        and not _foreign(folders, (glob.escape(name), _REPLACED_SUFFIX, f'*{_PARTIAL_SUFFIX}'))
         for _, folders, files in os.walk(folder)
     )
 

@@ -9,9 +9,9 @@ from typing import Any
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.error_line import error_line
 
-LARGEST = 700_000_000  # maximum memory of the text and its values, bytes
+MAX_MEMORY_BYTES = 700_000_000  # maximum memory of the text and its values, bytes
 # Memory per character that starts a Python object (list, dictionary, number or string), bytes.
-_TAKES = {b'[': 104, b'{': 210, b',': 24, b'"': 32}
+_BYTES_PER_VALUE = {b'[': 104, b'{': 210, b',': 24, b'"': 32}
 
 
 def read_plain_json(path: str | Path, largest: int) -> Any:
@@ -34,9 +34,11 @@ def load_plain_json(content: bytes | str) -> Any:
     """
     text = content.encode('utf-8', 'surrogatepass') if isinstance(content, str) else content
     needed = len(text) * (2 if text.isascii() else 5)
-    needed += sum(text.count(mark) * size for mark, size in _TAKES.items())
-    if needed > LARGEST:
-        raise ValueError(f'JSON whose values take {needed} bytes, wanted at most {LARGEST}')
+    needed += sum(text.count(mark) * size for mark, size in _BYTES_PER_VALUE.items())
+    if needed > MAX_MEMORY_BYTES:
+        raise ValueError(
+            f'JSON whose values take {needed} bytes, wanted at most {MAX_MEMORY_BYTES}'
+        )
     try:
         return json.loads(text)
     except RecursionError as error:

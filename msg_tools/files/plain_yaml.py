@@ -15,11 +15,18 @@ from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.error_line import error_line
 
 # Maximum number of nodes; a parser in pure Python takes 50 us per node.
-MOST_NODES = 20_000
-_DEEPEST = 50
-_LONGEST_NUMBER = 100  # characters; numbers of base 60 take quadratic time
+MAX_NODES = 20_000
+_MAX_DEPTH = 50
+_MAX_NUMBER_LENGTH = 100  # characters; numbers of base 60 take quadratic time
 # Exceptions of constructors for `!!bool x`, `!!int ""`, or `!!timestamp x`.
-_FAULTS = yaml.YAMLError, ValueError, ArithmeticError, RecursionError, LookupError, AttributeError
+_YAML_ERRORS = (
+    yaml.YAMLError,
+    ValueError,
+    ArithmeticError,
+    RecursionError,
+    LookupError,
+    AttributeError,
+)
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -28,16 +35,16 @@ class _PlainLoader(yaml.SafeLoader):
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError(f'line {self._line()}: an alias (*), wanted plain values')
-        if self._depth == _DEEPEST:
-            raise yaml.YAMLError(f'line {self._line()}: nested deeper than {_DEEPEST} levels')
+        if self._depth == _MAX_DEPTH:
+            raise yaml.YAMLError(f'line {self._line()}: nested deeper than {_MAX_DEPTH} levels')
         self._nodes += 1
-        if self._nodes > MOST_NODES:
-            raise yaml.YAMLError(f'line {self._line()}: more than {MOST_NODES} values')
+        if self._nodes > MAX_NODES:
+            raise yaml.YAMLError(f'line {self._line()}: more than {MAX_NODES} values')
         self._depth += 1
         node = super().compose_node(parent, index)
         self._depth -= 1
         kind = '' if node is None else node.tag.rpartition(':')[2]
-        if node is not None and kind in ('int', 'float') and len(node.value) > _LONGEST_NUMBER:
+        if node is not None and kind in ('int', 'float') and len(node.value) > _MAX_NUMBER_LENGTH:
             raise yaml.YAMLError(f'a number of {len(node.value)} characters')
         return node
 
@@ -72,5 +79,5 @@ def load_plain_yaml(text: str) -> Any:
     """
     try:
         return yaml.load(text, Loader=_PlainLoader)
-    except _FAULTS as error:
+    except _YAML_ERRORS as error:
         raise ValueError(error_line(error)) from error

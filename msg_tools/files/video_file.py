@@ -15,7 +15,7 @@ import cv2
 
 from msg_tools.files.mp4_boxes import boxes_at, mapped
 
-MOST_PIXELS = 2**26  # maximum size of an image, pixels
+MAX_PIXELS = 2**26  # maximum size of an image, pixels
 # MP4 and QuickTime, AVI, Matroska and WebM, Ogg, Flash, GIF, ASF, MPEG and H.264, YUV4MPEG2, IVF,
 # MPEG transport streams, sequences of JPEG images, DV, MXF.
 _CONTAINERS = re.compile(
@@ -54,7 +54,7 @@ def open_video(path: Path) -> cv2.VideoCapture:
 def check_size(capture: cv2.VideoCapture, path: Path) -> None:
     """Raises ValueError if the current image of a video is too large."""
     width, height = (capture.get(x) for x in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-    if width * height > MOST_PIXELS:
+    if width * height > MAX_PIXELS:
         raise ValueError(
-            f'{path} has images of {width:.0f}x{height:.0f} pixels, the limit is {MOST_PIXELS}'
+            f'{path} has images of {width:.0f}x{height:.0f} pixels, the limit is {MAX_PIXELS}'
         )

@@ -33,12 +33,12 @@ _ALIASES = {
     'kannala_brandt4': 'equidistant',
 }
 # Maximum skew that is ignored, in focal lengths; it shifts the border by up to about 2 px.
-_LARGEST_SKEW = 0.01
+_MAX_SKEW = 0.01
 
 # Limits of a valid calibration: ratio of focal lengths and principal point to the size of the
 # picture, and absolute value of distortion coefficients.
-_FARTHEST = 1000.0
-_LARGEST_COEFFICIENT = 1e6
+_MAX_RATIO = 1000.0
+_MAX_COEFFICIENT = 1e6
 
 
 class CameraInfoError(ValueError):
@@ -52,7 +52,7 @@ class UncalibratedError(CameraInfoError):
 def camera_from_info(
     message: Any,
     image_size: tuple[int, int] | None = None,
-    tell: Callable[[str], object] = lambda text: None,
+    notify: Callable[[str], object] = lambda text: None,
 ) -> Camera:
     """Converts a camera info to a camera.
 
@@ -60,7 +60,7 @@ def camera_from_info(
         message: sensor_msgs/CameraInfo, of `rosbags` or of ROS.
         image_size: (width, height) of the pictures, px; a calibration for another size with the
             same aspect ratio is scaled.
-        tell: called with a line of text for each approximation.
+        notify: called with a line of text for each approximation.
 
     Raises:
         CameraInfoError: not calibrated, values that are not finite or contradict each other, or an
@@ -76,13 +76,13 @@ def camera_from_info(
         raise CameraInfoError('camera info: K or D has values that are not finite')
     if k[0] < 0.0 or k[4] <= 0.0:
         raise CameraInfoError(f'camera info: focal lengths are {k[0]} and {k[4]}, wanted positive')
-    if abs(k[1]) >= _LARGEST_SKEW * k[0] or k[3] != 0.0 or k[6:] != [0.0, 0.0, 1.0]:
+    if abs(k[1]) >= _MAX_SKEW * k[0] or k[3] != 0.0 or k[6:] != [0.0, 0.0, 1.0]:
         raise CameraInfoError(
             f'camera info: K is {k}, wanted [fx, 0, cx, 0, fy, cy, 0, 0, 1] with a skew K[1] below '
-            f'{_LARGEST_SKEW * k[0]:.3g}; calibrate with the skew fixed at 0'
+            f'{_MAX_SKEW * k[0]:.3g}; calibrate with the skew fixed at 0'
         )
     if k[1] != 0.0:
-        tell(f'camera info: the skew of K, {k[1]:.3g} of {k[0]:.4g} pixels, is taken for 0')
+        notify(f'camera info: the skew of K, {k[1]:.3g} of {k[0]:.4g} pixels, is taken for 0')
     model, coefficients = _distortion(str(message.distortion_model), d)
     x, y, width, height = _region(message)
     _check_plausible(k, coefficients, max(width, height))
@@ -104,7 +104,7 @@ def camera_from_info(
             distortion_model=model,
         )
         if (share := unfolded_share(camera)) < 1.0:
-            tell(
+            notify(
                 f'camera info: beyond {share:.0%} of the way to a corner the distortion folds or '
                 'overstretches the image, and positions are wrong; calibrate with the pattern '
                 'there'
@@ -115,7 +115,7 @@ def camera_from_info(
         scaled = camera.scaled(wide, high)
     except ValueError as error:
         raise CameraInfoError(f'camera info: {error}') from error
-    tell(
+    notify(
         f'camera info: the calibration for images of {width}x{height} pixels is scaled to '
         f'{wide}x{high}; it is wrong if these are cropped from larger ones'
     )
@@ -124,7 +124,7 @@ def camera_from_info(
 
 def _check_plausible(k: list[float], coefficients: tuple[float, ...], size: int) -> None:
     """Raises CameraInfoError for implausible numbers, which could overflow when squared."""
-    low, high = size / _FARTHEST, size * _FARTHEST
+    low, high = size / _MAX_RATIO, size * _MAX_RATIO
     if not (low < k[0] < high and low < k[4] < high):
         raise CameraInfoError(
             f'camera info: focal lengths are {k[0]:g} and {k[4]:g}, wanted {low:g} to {high:g} '
@@ -134,10 +134,10 @@ def _check_plausible(k: list[float], coefficients: tuple[float, ...], size: int)
         raise CameraInfoError(
             f'camera info: principal point is ({k[2]:g}, {k[5]:g}), wanted at most {high:g}'
         )
-    if any(abs(value) > _LARGEST_COEFFICIENT for value in coefficients):
+    if any(abs(value) > _MAX_COEFFICIENT for value in coefficients):
         raise CameraInfoError(
             f'camera info: D has a coefficient of {max(coefficients, key=abs):g}, wanted at most '
-            f'{_LARGEST_COEFFICIENT:g}'
+            f'{_MAX_COEFFICIENT:g}'
         )
 
 

@@ -20,7 +20,7 @@ from hmt_ros.image.keypoint_schemes import Scheme, schemes
 from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.keypoints import (
-    FARTHEST_PIXEL,
+    MAX_PIXEL,
     checked_keypoints,
     keypoints_message,
     keypoints_of,
@@ -154,10 +154,10 @@ def people_of_boxes(message: Any) -> list[DetectedPerson]:
         size = np.array([detection.bbox.size_x, detection.bbox.size_y], dtype=np.float64)
         middle = np.array([centre.x, centre.y], dtype=np.float64)
         numbers = [*middle.tolist(), *size.tolist()]
-        if not ((size > 0).all() and np.abs(numbers).max() <= FARTHEST_PIXEL):
+        if not ((size > 0).all() and np.abs(numbers).max() <= MAX_PIXEL):
             raise MessageError(
                 f'detection {detection.id!r} has the centre and size {numbers}, wanted a box '
-                f'within {FARTHEST_PIXEL:g} px'
+                f'within {MAX_PIXEL:g} px'
             )
         left, top = (middle - 0.5 * size).tolist()
         right, bottom = (middle + 0.5 * size).tolist()

@@ -12,7 +12,7 @@ SECOND_NS = 1_000_000_000
 FRAME_ID = 'camera_optical_frame'  # default frame of a camera
 START_NS = 1_700_000_000 * SECOND_NS  # default stamp of the first image
 EARLIEST_NS = -(2**31) * SECOND_NS  # earliest time that a message can contain
-_STAMP_AT, _STAMP_SIZE = 4, 8  # offset and size of the stamp in CDR, bytes
+_STAMP_OFFSET, _STAMP_SIZE = 4, 8  # offset and size of the stamp in CDR, bytes
 
 
 def time_message(messages: MessageFactory, stamp_ns: int) -> Any:
@@ -37,10 +37,10 @@ def time_ns(time: Any) -> int:
 def stamp_in(data: bytes) -> int:
     """Stamp, ns, of the header at the start of a message in CDR bytes; 0 if invalid."""
     # After the encapsulation, whose second byte gives the byte order.
-    if len(data) < _STAMP_AT + _STAMP_SIZE:
+    if len(data) < _STAMP_OFFSET + _STAMP_SIZE:
         return 0
     order = '<' if data[1] & 1 else '>'
-    seconds, nanoseconds = struct.unpack_from(f'{order}iI', data, _STAMP_AT)
+    seconds, nanoseconds = struct.unpack_from(f'{order}iI', data, _STAMP_OFFSET)
     return int(seconds) * SECOND_NS + int(nanoseconds) if nanoseconds < SECOND_NS else 0
 
 

@@ -32,10 +32,10 @@ _LANDMARK = 'hri_msgs/msg/NormalizedPointOfInterest2D'
 REACH = 0.12
 # Rotation from the axes of the head's landmarks (x to the person's right, y backwards, z down) to
 # the axes of the reference model.
-_OF_HEAD = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_LANDMARKS_TO_HEAD = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 # Maximum difference of a landmark, or of a side of the region, between modes that agree, in heights
 # of the region.
-_AGREE = 0.1
+_AGREEMENT_DISTANCE = 0.1
 
 
 def ids_message(messages: MessageFactory, ids: Sequence[str], stamp_ns: int) -> Any:
@@ -81,7 +81,7 @@ def region_message(
         weights: (K,) weights of the modes. The confidence is the sum of the weights of modes whose
             sides differ by at most a tenth of the region's height from the shown sides.
     """
-    near = _AGREE * (region[3] - region[1])
+    near = _AGREEMENT_DISTANCE * (region[3] - region[1])
     agree = [other is not None and np.abs(other - region).max() <= near for other in others]
     corners = region / np.tile([camera.width, camera.height], 2)
     return messages.create(
@@ -115,7 +115,11 @@ def skeleton_message(
     # (0, 0) is the centre of the first pixel.
     pixels = camera.project(landmarks) + 0.5
     rows = pixels[shown, :, 1]
-    near = _AGREE * float(np.ptp(rows[np.isfinite(rows)])) if np.isfinite(rows).any() else 0.0
+    near = (
+        _AGREEMENT_DISTANCE * float(np.ptp(rows[np.isfinite(rows)]))
+        if np.isfinite(rows).any()
+        else 0.0
+    )
     apart = np.nan_to_num(np.linalg.norm(pixels - pixels[shown], axis=2), nan=np.inf)
     places = pixels[shown] / (camera.width, camera.height)
     confidences = np.minimum(product(weights, apart <= near), 1.0)
@@ -138,7 +142,7 @@ def landmarks_in_space(
     """
     marks = schemes()['skeleton2d'].landmarks
     names, rotations, _ = human.links()
-    head = product(product(human.rotation, rotations[names.index('head')]), _OF_HEAD)
+    head = product(product(human.rotation, rotations[names.index('head')]), _LANDMARKS_TO_HEAD)
     result = np.full((len(positions), len(marks), 3), np.nan)
     for i, mark in enumerate(marks):
         if mark.joint in joint_names:

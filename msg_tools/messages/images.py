@@ -32,7 +32,7 @@ MAX_PIXELS = 2**26
 _PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 # Byte offsets of the size and of the bit depth in a PNG; the next byte is the colour type, 0 for
 # grey.
-_PNG_SIZES, _PNG_DEPTH = 16, 24
+_PNG_SIZE_OFFSET, _PNG_DEPTH_OFFSET = 16, 24
 # Chunks of a PNG that are kept; texts, profiles and animations could unpack to any size.
 _PNG_CHUNKS = b'IHDR', b'PLTE', b'tRNS', b'IDAT', b'IEND'
 
@@ -196,7 +196,7 @@ def decode_mask(message: Any) -> Mask:
             'wanted png'
         )
     picture = decode_picture(content, f'format {str(message.format)!r}', cv2.IMREAD_GRAYSCALE)
-    depth, colours = content[_PNG_DEPTH : _PNG_DEPTH + 2]
+    depth, colours = content[_PNG_DEPTH_OFFSET : _PNG_DEPTH_OFFSET + 2]
     if depth > 8 or colours != 0:
         raise ImageError(
             f'compressed mask is a png of {depth} bits and colour type {colours}, wanted grey of '
@@ -225,7 +225,7 @@ def decode_picture(
         densest = _JPEG_PIXELS_PER_BYTE
     elif content.startswith(_PNG_SIGNATURE):
         content = _plain_png(content)
-        width, height = struct.unpack_from('>II', content, _PNG_SIZES)
+        width, height = struct.unpack_from('>II', content, _PNG_SIZE_OFFSET)
         if len(content) > _PNG_BYTES_PER_PIXEL * (width + 1) * (height + 1) + _PNG_BYTES:
             raise ImageError(f'png of {len(content)} bytes has more data than {width}x{height}')
         densest = _PNG_PIXELS_PER_BYTE

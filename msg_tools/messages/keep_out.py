@@ -30,7 +30,7 @@ _COLOUR = {'r': 0.85, 'g': 0.15, 'b': 0.10, 'a': 0.25}
 # Constants of shape_msgs/SolidPrimitive.
 _SOLID_SPHERE, _SOLID_CYLINDER = 2, 3
 # Length of an axis below which a capsule is a sphere, m.
-_POINT = 1e-6
+_MIN_AXIS_LENGTH = 1e-6
 
 
 class KeepOutState(IntEnum):
@@ -182,7 +182,7 @@ def _pieces(content: KeepOut) -> list[tuple[int, tuple[float, float], Array, Arr
         axis = end - start
         length = float(np.linalg.norm(axis, axis=0))
         result.append((_SPHERE, (float(radius), 0.0), start, upright))
-        if length < _POINT:
+        if length < _MIN_AXIS_LENGTH:
             continue
         result.append((_SPHERE, (float(radius), 0.0), end, upright))
         turn = _turn_to(axis / length)

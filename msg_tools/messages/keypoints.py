@@ -27,7 +27,7 @@ KEYPOINTS_2D, KEYPOINTS_3D = 'hmt_msgs/msg/Keypoints2D', 'hmt_msgs/msg/Keypoints
 # Maximum number of keypoints of one person; detectors find up to a few hundred.
 MAX_KEYPOINTS = 10_000
 # Maximum coordinates of a person: px from the first pixel, and m from the origin.
-FARTHEST_PIXEL, FARTHEST_POSITION = 1e6, 1e3
+MAX_PIXEL, MAX_POSITION = 1e6, 1e3
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def checked_keypoints(
     """
     seen = (confidences != 0) & ~np.isnan(pixels).all(1) & (pixels != 0).any(1)
     for i in np.flatnonzero(seen):
-        _check_point(names[i], pixels[i], confidences[i], FARTHEST_PIXEL, 'px')
+        _check_point(names[i], pixels[i], confidences[i], MAX_PIXEL, 'px')
         if covariances is not None and not np.isnan(covariances[i]).all():
             check_covariances(covariances[i], f'keypoint {names[i]}')
     pixels[~seen], confidences[~seen] = np.nan, 0.0
@@ -119,7 +119,7 @@ def positions_of(message: Any) -> Positions:
     names, positions, confidences = _points_of(message, 'xyz', 'keypoints_3d')
     seen = (confidences != 0) & ~np.isnan(positions).all(1)
     for i in np.flatnonzero(seen):
-        _check_point(names[i], positions[i], confidences[i], FARTHEST_POSITION, 'm')
+        _check_point(names[i], positions[i], confidences[i], MAX_POSITION, 'm')
     positions[~seen] = np.nan
     return Positions(names, positions)
 

@@ -29,20 +29,20 @@ _CUBE, _LINE_LIST, _SPHERE_LIST = 1, 5, 7
 _BONES, _JOINTS = 0, 1
 
 # The heaviest mode is orange, the others are blue, which colour-blind people can distinguish.
-_FIRST = (0.90, 0.45, 0.05)
-_OTHERS = (0.10, 0.45, 0.80)
-_FAINTEST = 0.12
+_FIRST_COLOUR = (0.90, 0.45, 0.05)
+_OTHER_COLOUR = (0.10, 0.45, 0.80)
+_MIN_OPACITY = 0.12
 
 FLOOR, CONTACTS = 'floor', 'contacts'
 # Side and thickness of the floor marker, m; its top is the floor.
-_SIDE, _THICK = 3.0, 0.005
+_FLOOR_SIDE, _FLOOR_THICKNESS = 3.0, 0.005
 _FLOOR_COLOUR = (0.55, 0.55, 0.50), 0.30
 _CONTACT_COLOUR = (0.00, 0.62, 0.45)
-_SPHERE = 0.09  # diameter, m
+_SPHERE_DIAMETER = 0.09  # diameter, m
 # Minimum probability of a shown contact.
-_LEAST = 0.05
+_MIN_CONTACT_PROBABILITY = 0.05
 # Suffixes of the joint names of a foot.
-_OF_FOOT = ('ankle', 'toe')
+_FOOT_SUFFIXES = ('ankle', 'toe')
 
 
 def skeleton_markers(
@@ -176,8 +176,8 @@ def _ranked_markers(
             pair = shown(order[rank])
             heaviest = float(weights[order[0]])
             share = float(weights[order[rank]]) / heaviest if heaviest > 0 else 1.0
-            alpha = _FAINTEST + (1 - _FAINTEST) * share
-            colour = _colour(messages, _OTHERS if rank else _FIRST, alpha)
+            alpha = _MIN_OPACITY + (1 - _MIN_OPACITY) * share
+            colour = _colour(messages, _OTHER_COLOUR if rank else _FIRST_COLOUR, alpha)
             pair = [
                 {'action': _ADD if x['points'] else _DELETE, 'color': colour, **x} for x in pair
             ]
@@ -235,7 +235,7 @@ def ground_markers(
             ns=CONTACTS,
             type=_SPHERE_LIST,
             action=_ADD,
-            scale=_size(messages, _SPHERE),
+            scale=_size(messages, _SPHERE_DIAMETER),
             color=_colour(messages, _CONTACT_COLOUR, 1.0),
             points=messages.points(np.array(points)),
             colors=[_colour(messages, _CONTACT_COLOUR, share) for share in shares],
@@ -257,9 +257,9 @@ def _standing(
     points, shares = [], []
     for foot, probability in content.contacts.items():
         side = foot.removesuffix('_foot')
-        for joint in _OF_FOOT:
+        for joint in _FOOT_SUFFIXES:
             place = places.get(f'{side}_{joint}')
-            if place is not None and probability >= _LEAST:
+            if place is not None and probability >= _MIN_CONTACT_PROBABILITY:
                 points.append(positions[place])
                 shares.append(probability)
     return points, shares
@@ -272,7 +272,7 @@ def _floor(messages: MessageFactory, header: Any, plane: Array, over: Array) -> 
     x = across - (across * up).sum() * up
     x /= np.linalg.norm(x, axis=0)
     rotation = np.stack([x, np.cross(up, x), up], axis=1)
-    place = over - ((over * up).sum() + height + _THICK / 2) * up
+    place = over - ((over * up).sum() + height + _FLOOR_THICKNESS / 2) * up
     return _marker(
         messages,
         header,
@@ -280,7 +280,9 @@ def _floor(messages: MessageFactory, header: Any, plane: Array, over: Array) -> 
         type=_CUBE,
         action=_ADD,
         pose=pose_message(messages, place, quaternions(rotation[None])[0]),
-        scale=messages.create('geometry_msgs/msg/Vector3', x=_SIDE, y=_SIDE, z=_THICK),
+        scale=messages.create(
+            'geometry_msgs/msg/Vector3', x=_FLOOR_SIDE, y=_FLOOR_SIDE, z=_FLOOR_THICKNESS
+        ),
         color=_colour(messages, *_FLOOR_COLOUR),
     )
 

@@ -46,8 +46,8 @@ POSE_MIXTURE = 'hmt_msgs/msg/PoseMixture'
 # Maximum number of components; a message with millions would block its reader.
 MAX_COMPONENTS = 1024
 # Optional arrays of likelihoods, and optional arrays of joints.
-OF_LIKELIHOODS = ('shape_covariance', 'posterior_weights', 'ancestry')
-OF_JOINTS = ('joint_covariances', 'joint_covariances_relative', 'joint_velocities')
+LIKELIHOOD_ARRAYS = ('shape_covariance', 'posterior_weights', 'ancestry')
+JOINT_ARRAYS = ('joint_covariances', 'joint_covariances_relative', 'joint_velocities')
 
 
 class MixtureKind(IntEnum):
@@ -177,10 +177,10 @@ class PoseMixture:
         if self.degrees_of_freedom is None:
             object.__setattr__(self, 'degrees_of_freedom', np.zeros(components))
         freeze_arrays(
-            self, shapes, 'mixture', optional=('covariances', *OF_LIKELIHOODS, *OF_JOINTS)
+            self, shapes, 'mixture', optional=('covariances', *LIKELIHOOD_ARRAYS, *JOINT_ARRAYS)
         )
         check_finite(self.means, 'mixture: mean')
-        for name in ('joint_positions', *OF_JOINTS):
+        for name in ('joint_positions', *JOINT_ARRAYS):
             if (values := getattr(self, name)) is not None:
                 check_finite(values, f'mixture: {name}')
         if components:

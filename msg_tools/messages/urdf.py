@@ -29,7 +29,7 @@ from hmt_ros.inference.linear_algebra import product
 from msg_tools.messages.message_error import Array, MessageError
 
 # Limit of unlimited joints, m or rad, because URDF requires a limit.
-_UNLIMITED = 1000.0
+_MAX_LIMIT = 1000.0
 _AXES = ('1 0 0', '0 1 0', '0 0 1')
 
 
@@ -92,8 +92,8 @@ def _add_segment(
         ET.SubElement(joint, 'child', link=link)
         if dof is not None:
             ET.SubElement(joint, 'axis', xyz=_AXES[int(skeleton.dof_axes[dof])])
-            lower = max(float(skeleton.lower[dof]), -_UNLIMITED)
-            upper = min(float(skeleton.upper[dof]), _UNLIMITED)
+            lower = max(float(skeleton.lower[dof]), -_MAX_LIMIT)
+            upper = min(float(skeleton.upper[dof]), _MAX_LIMIT)
             add_limit(joint, lower, upper)
         joints.append(joint)
         element = ET.SubElement(robot, 'link', name=link)

@@ -9,7 +9,7 @@ import pytest
 
 from hmt_learning.app import make_bag
 from hmt_ros.app import progress
-from hmt_ros.app.progress import INTERVAL, show_progress, tell_user, with_progress
+from hmt_ros.app.progress import INTERVAL, notify_user, show_progress, with_progress
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def test_a_line_every_interval(capsys):
     with show_progress('out', 'images', 120) as shown:
         wait_for(capsys, 'out:   0% 0/120 [00:00<?')  # shows that the command works
         shown.update(60)
-        tell_user('replay', 'a line between')
+        notify_user('replay', 'a line between')
         assert 'replay: a line between\n' in wait_for(capsys, 'out:  50% 60/120 [')
         shown.update(60)
     lines = capsys.readouterr().err.splitlines()

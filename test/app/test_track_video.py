@@ -34,11 +34,11 @@ def begun(monkeypatch):
     """Recorded options of imports, settings of replays and notes of reports, which do not run."""
     seen = SimpleNamespace(imports=[], settings=[], notes=[])
     monkeypatch.setattr(
-        track_video, 'import_video', lambda options, tell: seen.imports.append(options)
+        track_video, 'import_video', lambda options, notify: seen.imports.append(options)
     )
     monkeypatch.setattr(
         track_video, 'replay_bag',
-        lambda source, target, options, tell: seen.settings.append(options.settings),
+        lambda source, target, options, notify: seen.settings.append(options.settings),
     )  # fmt: skip
 
     def write_report(options):
@@ -89,7 +89,7 @@ def test_a_stature_and_a_subject_file(walk_video, tmp_path, monkeypatch):
     """A stature makes a subject file from keypoints; one that is given is used as it is."""
     used = []
 
-    def replay_bag(source, target, options, tell):
+    def replay_bag(source, target, options, notify):
         used.append(options.subject)
         raise ValueError('enough')
 

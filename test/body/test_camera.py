@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from hmt_ros.body import Camera
 from hmt_ros.body.camera import (
-    FARTHEST_PERSON,
-    LEAST_UNFOLDED,
-    NEAREST_PERSON,
-    USUAL_LENS,
+    FAR_PERSON_DISTANCE,
+    MIN_UNFOLDED_FRACTION,
+    NEAR_PERSON_DISTANCE,
+    USUAL_ANGLE_OF_VIEW,
     log_prior_of_distance,
     unfolded_share,
 )
@@ -152,7 +152,7 @@ def test_distortions_of_real_cameras_do_not_fold(focal, size, model, coefficient
     """Colour and grey cameras of public data sets, fisheyes that see more than half of a sphere."""
     width, height = size
     camera = Camera(focal, focal, width / 2, height / 2, width, height, coefficients, model)
-    assert unfolded_share(camera) >= LEAST_UNFOLDED
+    assert unfolded_share(camera) >= MIN_UNFOLDED_FRACTION
 
 
 def test_scaled_camera_sees_the_same_through_larger_pixels():
@@ -169,12 +169,12 @@ def test_scaled_camera_sees_the_same_through_larger_pixels():
 
 def test_distances_that_people_and_cameras_have():
     """A log-normal prior with 95 % between limits that scale with the focal length."""
-    focal = 320.0 / np.tan(0.5 * USUAL_LENS)
+    focal = 320.0 / np.tan(0.5 * USUAL_ANGLE_OF_VIEW)
     usual = Camera(focal, focal, 319.5, 239.5, 640, 480)
     far = replace(usual, fx=3.0 * focal, fy=3.0 * focal)
-    middle = np.sqrt(NEAREST_PERSON * FARTHEST_PERSON)
+    middle = np.sqrt(NEAR_PERSON_DISTANCE * FAR_PERSON_DISTANCE)
     assert log_prior_of_distance(usual, middle) == pytest.approx(0.0)
-    for limit in (NEAREST_PERSON, FARTHEST_PERSON):
+    for limit in (NEAR_PERSON_DISTANCE, FAR_PERSON_DISTANCE):
         assert log_prior_of_distance(usual, limit) == pytest.approx(-2.0)
         assert log_prior_of_distance(far, 3.0 * limit) == pytest.approx(-2.0)
     assert -6.0 < log_prior_of_distance(usual, 50.0) < -5.0

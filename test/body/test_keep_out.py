@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
-from hmt_ros.body.keep_out import BARE, MARGIN, Capsules, keep_out_capsules
+from hmt_ros.body.keep_out import BARE_BONE_RADIUS, MARGIN, Capsules, keep_out_capsules
 from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
 
@@ -70,7 +70,7 @@ def test_a_body_without_flesh_has_its_bones():
     bare = replace(BODY, shapes=(), growth=())
     held = keep_out_capsules(bare, posterior(weights=(1.0,)))
     assert len(held) <= len(BODY.skeleton.bones)
-    assert held.radii.min() == pytest.approx(BARE + MARGIN, abs=0.03)
+    assert held.radii.min() == pytest.approx(BARE_BONE_RADIUS + MARGIN, abs=0.03)
     assert held.contain(BODY.joint_positions(posterior(weights=(1.0,)).means)[0]).all()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
-from hmt_ros.body.model_file import STATURE_SPREAD, held, length_covariance
+from hmt_ros.body.model_file import STATURE_SPREAD, conditioned_covariance, length_covariance
 
 LENGTHS, PROPORTIONS = np.array([0.42, 0.41, 0.02]), np.array([0.04, 0.05, 0.8])
 
@@ -29,11 +29,11 @@ def test_what_is_measured_holds_lengths():
     people = rng.multivariate_normal(np.zeros(3), covariance, 400_000)
     cost = 0.5 * (((people @ rows.T) / sigma) ** 2).sum(1)
     brute = np.cov(people.T, aweights=np.exp(-cost))
-    found = held(covariance, rows, sigma)
+    found = conditioned_covariance(covariance, rows, sigma)
     assert np.allclose(found, brute, rtol=0.03, atol=2e-6)
     information = np.linalg.inv(covariance) + rows.T @ np.diag(sigma**-2.0) @ rows
     assert np.allclose(found, np.linalg.inv(information))
-    assert np.array_equal(held(covariance, np.zeros((0, 3)), []), covariance)
+    assert np.array_equal(conditioned_covariance(covariance, np.zeros((0, 3)), []), covariance)
 
 
 @pytest.mark.parametrize('name', ['human37', 'human34', 'human32'])

@@ -5,7 +5,7 @@ import pytest
 
 from hmt_ros.body import load_body
 from hmt_ros.body.mirror import mirror_order
-from hmt_ros.body.postures import SUPPOSED, postures_of
+from hmt_ros.body.postures import PREDICTION_SHARE, postures_of
 from hmt_ros.inference.mixture import GaussianMixture
 
 
@@ -66,7 +66,7 @@ def test_legs_that_nothing_ever_showed_are_the_modes_or_those_of_the_table(body,
     for k in range(2):
         (mine,) = np.flatnonzero((rows == k) & (which == 0))
         assert spread.means[mine] == pytest.approx(modes.means[k])
-        assert spread.weights[mine] == pytest.approx(SUPPOSED * modes.weights[k], rel=0.1)
+        assert spread.weights[mine] == pytest.approx(PREDICTION_SHARE * modes.weights[k], rel=0.1)
 
 
 def test_a_pelvis_that_nothing_shows_turns_below_shoulders_that_stay(body, modes):

@@ -9,7 +9,7 @@ from hmt_ros.body.mirror import Trunk
 from hmt_ros.core import face_back, point_left, rate_histories, rate_transitions
 from hmt_ros.core import weigh_ways as weigh
 from hmt_ros.inference.linear_algebra import log_sum_exp
-from hmt_ros.tracking.classes import Ways
+from hmt_ros.tracking.classes import FacingInputs
 from hmt_ros.tracking.weighting import Transition
 from test.core.arguments import assert_arguments_are_checked
 
@@ -23,7 +23,7 @@ def given(seed, modes=3, count=7, joints=6):
     before, back, followed = (rng.random(n) < 0.5 for n in (modes, count, count))
     return {
         'trunk': TRUNK,
-        'ways': Ways(before, back, 0.3, rng.normal(), 4.0, 0.9, 10.0),
+        'ways': FacingInputs(before, back, 0.3, rng.normal(), 4.0, 0.9, 10.0),
         'first': rng.normal(size=(modes, joints, 3)),
         'joints': rng.normal(size=(count, joints, 3)),
         'transitions': -rng.exponential(size=(modes, count)),

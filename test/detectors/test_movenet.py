@@ -242,7 +242,7 @@ def test_what_differs_is_unsure():
 
 def test_it_finds_what_tensorflow_finds():
     """TensorFlow.js 4.22 saw the squares about the first images of bags/reach."""
-    if not movenet_models.FILES.are_there():
+    if not movenet_models.FILES.exist():
         pytest.skip('MoveNet is not installed: run "install-detector mediapipe+movenet"')
     with np.load(Path(__file__).parent / 'reach_movenet.npz') as file:
         known = file['rows']

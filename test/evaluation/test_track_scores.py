@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
-from hmt_ros.evaluation.pose_scores import BATCH, EVALUATED_JOINTS, HIPS, joint_mixtures, score
+from hmt_ros.evaluation.pose_scores import BATCH_SIZE, EVALUATED_JOINTS, HIPS, joint_mixtures, score
 from hmt_ros.evaluation.track_scores import Estimate, TrackScorer, Truth, mode_errors
 from hmt_ros.inference import GaussianMixture
 
-TIMES = 2 * BATCH + 5
+TIMES = 2 * BATCH_SIZE + 5
 
 
 @pytest.fixture(scope='module')

@@ -7,8 +7,8 @@ from scipy.stats import multivariate_normal
 
 from hmt_ros.experts.basis import LinearBasis, RadialBasis
 from hmt_ros.experts.gates import (
-    RATE,
-    SHAPE,
+    GAMMA_RATE,
+    GAMMA_SHAPE,
     GaussianGates,
     SoftmaxGates,
     _Softmax,
@@ -118,8 +118,8 @@ def test_laplace_value_is_written_out(rng):
         - 0.5 * (precisions * weights**2).sum()
         + 1.5 * np.log(precisions).sum()
         - 0.5 * np.linalg.slogdet(hessian)[1]
-        + (SHAPE * np.log(precisions) - RATE * precisions).sum()
-        - len(precisions) * (SHAPE * np.log(SHAPE / RATE) - SHAPE)
+        + (GAMMA_SHAPE * np.log(precisions) - GAMMA_RATE * precisions).sum()
+        - len(precisions) * (GAMMA_SHAPE * np.log(GAMMA_SHAPE / GAMMA_RATE) - GAMMA_SHAPE)
     )
     assert found.value == pytest.approx(expected, abs=1e-9)
     variances = np.diagonal(np.linalg.inv(hessian)).reshape(shape)

@@ -23,8 +23,8 @@ from hmt_ros.experts.lifter import (
     EXCHANGED_INPUTS,
     EXCHANGES,
     LANDMARKS,
-    MOST,
-    PROPORTIONED,
+    MAX_COMPONENTS,
+    PROPORTION_LENGTHS,
     TIMES,
     KeypointHistory,
     Lifter,
@@ -45,7 +45,7 @@ from hmt_ros.image.terms.keypoints import USUAL_STATURE, Keypoints
 
 BODY = load_body('human37')
 CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
-INPUTS = len(TIMES) * (3 * len(LANDMARKS) + 2) + 5 + len(PROPORTIONED) + 1
+INPUTS = len(TIMES) * (3 * len(LANDMARKS) + 2) + 5 + len(PROPORTION_LENGTHS) + 1
 
 
 def walking(count: int = 12) -> np.ndarray:
@@ -163,7 +163,7 @@ def test_inputs_do_not_depend_on_where_the_person_is_in_the_image():
     rng = np.random.default_rng(0)
     rays = 0.1 * rng.normal(size=(1, len(TIMES), len(LANDMARKS), 2))
     sure = np.ones((1, len(TIMES), len(LANDMARKS)))
-    ups, none = np.array([[0.0, -1.0, 0.0]]), np.zeros((1, len(PROPORTIONED)))
+    ups, none = np.array([[0.0, -1.0, 0.0]]), np.zeros((1, len(PROPORTION_LENGTHS)))
     first = window_inputs(rays, sure, TIMES[None], ups, none)
     turn = ray_rotations(np.array([[0.0, 0.3, 1.0]]))[0]
     moved = np.concatenate([rays, np.ones((*rays.shape[:3], 1))], axis=3) @ turn.T
@@ -234,7 +234,7 @@ def test_inputs_are_exchanged_as_landmarks_are(order):
     rng = np.random.default_rng(order)
     shape = (3, len(TIMES), len(LANDMARKS))
     rays, sure = rng.normal(0, 0.1, (*shape, 2)), rng.random(shape)
-    known = np.tile(TIMES, (3, 1)), np.zeros((3, 3)), np.zeros((3, len(PROPORTIONED)))
+    known = np.tile(TIMES, (3, 1)), np.zeros((3, 3)), np.zeros((3, len(PROPORTION_LENGTHS)))
     found = window_inputs(rays, sure, *known).values[:, EXCHANGED_INPUTS[order]]
     rows = EXCHANGES[order]
     wanted = window_inputs(rays[:, :, rows], sure[:, :, rows], *known).values
@@ -253,7 +253,7 @@ def test_exchanged_sides_are_among_the_answers():
         (one,) = lifter.lift(stamps, rays, sure, stamps[-1:], causal=True, exchanges=exchanges)
         distances = np.linalg.norm(one.means - true, axis=2).mean(1)
         assert logsumexp(one.log_weights) == pytest.approx(0.0, abs=1e-9)
-        assert len(distances) == (5 if exchanges is None else MOST)
+        assert len(distances) == (5 if exchanges is None else MAX_COMPONENTS)
         return np.exp(one.log_weights)[distances < 0.1].sum()
 
     assert weight_near(None) < 0.08

@@ -14,7 +14,7 @@ from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS
 from hmt_ros.experts import LocalExperts, NearestNeighbours
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError
-from hmt_ros.experts.pose_predictor import ALONE, BY_EXPERTS, PosePredictor
+from hmt_ros.experts.pose_predictor import BY_EXPERTS, WITHOUT_PROPAGATION, PosePredictor
 from test.forged_models import write_forged
 
 CAMERA = Camera(400.0, 400.0, 199.5, 149.5, 400, 300)
@@ -101,7 +101,7 @@ def test_rule_one_needs_a_model(
     plain = learned_predictor(body, training, NearestNeighbours(5, 'common'))
     mask = clip[1][3]
     alone = plain.predict(mask, CAMERA)
-    assert plain.observe(mask, CAMERA, alone, propagation=ALONE).mixture == alone
+    assert plain.observe(mask, CAMERA, alone, propagation=WITHOUT_PROPAGATION).mixture == alone
     with pytest.raises(ValueError, match='train it with --dynamics'):
         plain.observe(mask, CAMERA, alone, propagation=BY_EXPERTS)
     with pytest.raises(ValueError, match="no propagation 'rule'"):

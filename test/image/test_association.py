@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.image.association import (
-    GATE,
+    GATE_COST,
     ImageTrack,
     Sighting,
     assigned,
@@ -56,8 +56,8 @@ def test_the_cost_is_the_median_way_in_sizes():
 
 def test_the_gate_opens_while_somebody_is_not_seen():
     track = walked(0.0, 0.0, images=1)
-    assert track.gate(0) == GATE
-    assert track.gate(30 * FRAME) == 2.0 * GATE
+    assert track.gate(0) == GATE_COST
+    assert track.gate(30 * FRAME) == 2.0 * GATE_COST
     far = sighting(0.6 * track.size)
     assert assigned([track], [far], FRAME) == {}
     assert assigned([track], [far], 10 * FRAME) == {0: 0}

@@ -10,7 +10,7 @@ from hmt_learning.rendering.renderer import render, sensed_depth
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.body import Camera
 from hmt_ros.body.kinematics import forward
-from hmt_ros.core import ASIDE, BEHIND, COVER, DEPTH_JUMP, FEWEST, LEAST_COSINE
+from hmt_ros.core import ASIDE, BEHIND, COVER, DEPTH_JUMP, MIN_COSINE, MIN_POINTS
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Beliefs, observe
 from hmt_ros.image.surface import flesh_table_of
@@ -109,7 +109,7 @@ def oracle_energy(body, camera, settings, depth, pose, held=None, factors=None):
         error = (z - point[2]) / sigma if z > 0 else 1.0
         factor = 1.0 if factors is None else factors[segment]
         costs.append(factor * 0.5 * error**2 / (1.0 + error**2 / settings.scale**2))
-    return settings.weight * np.sum(costs) / max(len(points), FEWEST)
+    return settings.weight * np.sum(costs) / max(len(points), MIN_POINTS)
 
 
 def oracle_points(body, camera, settings, depth, pose):
@@ -120,7 +120,7 @@ def oracle_points(body, camera, settings, depth, pose):
         point = frames.points(np.array([segment]), place[None])[0, :, 0]
         ahead = frames.points(np.array([segment]), (place + normal)[None])[0, :, 0] - point
         cosine = -(ahead @ point) / np.linalg.norm(point)
-        if cosine > LEAST_COSINE and point[2] > 0.1 and not is_hidden(body, frames, part, point):
+        if cosine > MIN_COSINE and point[2] > 0.1 and not is_hidden(body, frames, part, point):
             z = measured_at(depth, *camera.project(point[None])[0])
             variance = settings.sigma**2 + (settings.growth * z * z) ** 2
             points.append((segment, place, np.sqrt(variance + (deviation / cosine) ** 2)))

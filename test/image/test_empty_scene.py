@@ -13,7 +13,13 @@ from hmt_learning.rendering.renderer import render_frames
 from hmt_learning.rendering.scene import Scene
 from hmt_ros.body.camera import Camera
 from hmt_ros.image.background import BackgroundModel
-from hmt_ros.image.empty_scene import KNOWN, STILL, STILLEST, UNSEEN, EmptyScene
+from hmt_ros.image.empty_scene import (
+    MIN_STILL_LOG_ODDS,
+    STILL_TIME,
+    UNSEEN,
+    USABLE_LOG_ODDS,
+    EmptyScene,
+)
 
 SECOND = 1_000_000_000
 CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
@@ -47,10 +53,10 @@ def seen_for(image, seconds, rate, scene=None, start=0):
 @pytest.mark.parametrize('rate', [30.0, 8.0])
 def test_how_long_it_takes_does_not_depend_on_the_rate(crossing, rate):
     empty = crossing[1]
-    wanted = -KNOWN * STILL
+    wanted = -USABLE_LOG_ODDS * STILL_TIME
     assert not seen_for(empty, wanted - 0.2, rate).known
     assert seen_for(empty, wanted + 0.2, rate).known
-    assert seen_for(empty, 1.0, rate).log_odds == pytest.approx(-1.0 / STILL)
+    assert seen_for(empty, 1.0, rate).log_odds == pytest.approx(-1.0 / STILL_TIME)
 
 
 def test_a_scene_in_which_somebody_moves_is_not_empty(crossing):
@@ -85,13 +91,13 @@ def test_a_ghost_gives_itself_away(crossing):
     assert ghost.known
     for i, image in enumerate(images[8:]):
         for scene in (ghost, true):
-            scene.judge(image, 4 * SECOND + i * SECOND // 10)
+            scene.update(image, 4 * SECOND + i * SECOND // 10)
         if i == 0:
             # The first silhouette has no effect.
             assert not ghost.known
         assert true.known
     assert ghost.is_of_somebody
-    assert true.log_odds < STILLEST - 2.0
+    assert true.log_odds < MIN_STILL_LOG_ODDS - 2.0
 
 
 def test_what_is_given_is_neither_learned_nor_judged(crossing):
@@ -102,7 +108,7 @@ def test_what_is_given_is_neither_learned_nor_judged(crossing):
     assert not shared.known
     for scene in (given, shared):
         scene.learn(empty, 0)
-        scene.judge(images[5], 1)
+        scene.update(images[5], 1)
         assert scene.log_odds == -math.inf
     assert given.background.frames == 1
     shared.background.learn(empty)

@@ -8,7 +8,7 @@ from hmt_ros.body import Camera, load_body
 from hmt_ros.image.keypoint_schemes import usual_exchanges
 from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, bone_lengths
 from hmt_ros.image.terms.keypoints import (
-    LIFTED_SCALE,
+    LIFTED_KERNEL,
     LIFTED_WEIGHT,
     NOT_EXCHANGED,
     Keypoints,
@@ -65,7 +65,7 @@ def density(poses, x):
     depth = (joints[BODY.skeleton.joint_index(poses.joints)] - hips) @ poses.axes[2]
     mean, sigma = poses.sized(BODY.skeleton)[:, :, 2], poses.deviations[:, :, 2]
     square = ((depth - mean) / sigma) ** 2
-    kernel = 0.5 * square / (1.0 + square / LIFTED_SCALE**2)
+    kernel = 0.5 * square / (1.0 + square / LIFTED_KERNEL**2)
     return -float(logsumexp(poses.log_weights - (kernel + np.log(sigma)).sum(1)))
 
 

@@ -48,7 +48,7 @@ def watched(room, still, count=60, **change):
     watch, background, first = SceneWatch(), BackgroundModel.from_image(room), None
     for index in range(count):
         image = seen(room, index, **change) if index >= count // 2 else still(index)
-        watch.look(image, background)
+        watch.update(image, background)
         if watch.moved and first is None:
             first = index
     return watch, first
@@ -80,5 +80,5 @@ def test_one_bad_image_is_no_motion(room, still):
     watch, background = SceneWatch(), BackgroundModel.from_image(room)
     for index in range(60):
         image = seen(room, index, shift=(12.0, 0.0)) if index == 30 else still(index)
-        watch.look(image, background)
+        watch.update(image, background)
         assert not watch.moved

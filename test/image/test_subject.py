@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from hmt_ros.body import load_body
-from hmt_ros.image.subject import LARGEST_FILE, parse_subject
+from hmt_ros.image.subject import MAX_FILE_BYTES, parse_subject
 from hmt_ros.tracking import Subject, SubjectError, read_subject
 
 JOINTS = {'head': [150, 20.5], 'neck': [151, 40], 'left_hip': [160, 110], 'right_hip': [140, 111]}
@@ -147,7 +147,7 @@ def test_files_that_can_not_be_read(body, tmp_path):
             read_subject(path, body)
         assert str(path) in one_line(caught)
     large = tmp_path / 'large.yaml'
-    large.write_bytes(b'#' * (LARGEST_FILE + 1))
+    large.write_bytes(b'#' * (MAX_FILE_BYTES + 1))
     with pytest.raises(SubjectError, match='250001 bytes') as caught:
         read_subject(large, body)
     one_line(caught)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body.kinematics import forward
-from hmt_ros.core import LEAST_FACING
+from hmt_ros.core import MIN_FACING
 from hmt_ros.image.surface_points import SurfacePoints, seen_points
 from test.oracles import numpy_likelihood as oracle
 
@@ -91,7 +91,7 @@ def test_points_face_the_camera_and_nothing_is_before_them(shot, poses, points):
                 [inside(part, local[own] + s) - inside(part, local[own] - s) for s in steps], axis=1
             )
             normals = slopes / np.linalg.norm(slopes, axis=1)[:, None]
-            assert (-(normals * at_camera).sum(1)).min() > LEAST_FACING - 1e-4
+            assert (-(normals * at_camera).sum(1)).min() > MIN_FACING - 1e-4
 
 
 def test_what_others_hide_is_not_seen(shot, poses, points):

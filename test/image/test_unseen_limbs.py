@@ -41,7 +41,7 @@ def keypoints(body, pose, without=(), confidence=1.0):
 
 def unseen_after(body, pose, camera, observation):
     limbs = UnseenLimbs(body)
-    limbs.look(body, camera, observation, pose, np.inf)
+    limbs.update(body, camera, observation, pose, np.inf)
     return {x for x, t in zip(body.dof_names, limbs.of_dofs(body), strict=True) if t > 0}
 
 
@@ -78,21 +78,21 @@ def test_times_add_up_until_the_limb_is_shown_again(body, pose):
     whole = Observation(keypoints=keypoints(body, pose))
     cut = Observation(keypoints=keypoints(body, pose, ('ankle', 'toe')))
     knee = body.dof_names.index('left_knee')
-    limbs.look(body, camera, whole, pose, np.inf)
+    limbs.update(body, camera, whole, pose, np.inf)
     for expected in (0.1, 0.2):
-        limbs.look(body, camera, cut, pose, 0.1)
+        limbs.update(body, camera, cut, pose, 0.1)
         assert limbs.of_dofs(body)[knee] == pytest.approx(expected)
-    limbs.look(body, camera, whole, pose, 0.1)
+    limbs.update(body, camera, whole, pose, 0.1)
     assert limbs.of_dofs(body).max() == 0.0
 
 
 def test_unseen_joints_err_by_the_lengths_of_their_bones(body, pose):
     limbs = UnseenLimbs(body)
-    assert limbs.told(body) is body
+    assert limbs.with_larger_errors(body) is body
     seen = Observation(keypoints=keypoints(body, pose, ('knee', 'ankle', 'toe')))
-    limbs.look(body, camera_to(240), seen, pose, np.inf)
-    told = limbs.told(body)
-    more = np.sqrt(told.joint_errors**2 - body.joint_errors**2)
+    limbs.update(body, camera_to(240), seen, pose, np.inf)
+    with_larger_errors = limbs.with_larger_errors(body)
+    more = np.sqrt(with_larger_errors.joint_errors**2 - body.joint_errors**2)
     of = dict(zip(body.joint_names, more, strict=True))
     thigh, shin = (body.segment_lengths[x] for x in ('thigh', 'shin'))
     assert of['left_knee'] == pytest.approx(0.08 * thigh)

@@ -116,10 +116,10 @@ def test_changes_of_what_lasts_are_told_by_what_is_new_of_it(rho):
     # The variance of the mean of n errors, compared with n discounted images.
     means = error[: 200_000 // 500 * 500].reshape(-1, 500).mean(1)
     assert 500 * np.var(means) == pytest.approx(1.0 / errors.share(dt), rel=0.15)
-    assert errors.lasting(dt) == pytest.approx(1.0 / (1.0 - rho) ** 2)
+    assert errors.persistence_ratio(dt) == pytest.approx(1.0 / (1.0 - rho) ** 2)
 
 
 def test_what_does_not_last_is_told_once():
     for errors, dt in ((CueErrors(0.5, 0.0), 0.1), (CueErrors(0.5, 0.1), np.inf)):
         assert errors.of_changes(dt) == errors.share(dt) == 0.5
-        assert errors.lasting(dt) == 1.0
+        assert errors.persistence_ratio(dt) == 1.0

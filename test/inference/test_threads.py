@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from hmt_ros.inference.threads import MOST_THREADS, in_threads, limit_threads, together
+from hmt_ros.inference.threads import MAX_THREADS, in_threads, limit_threads, together
 
 
 @pytest.mark.parametrize('threads', [1, 2, 5])
@@ -70,6 +70,6 @@ def test_a_process_can_be_limited():
         in_threads(lambda first, last: parts.append((first, last)), 40, 2, 4)
         own = set(together(3 * [threading.get_ident], 4))
     finally:
-        limit_threads(MOST_THREADS)
+        limit_threads(MAX_THREADS)
     assert parts == [(0, 40)]
     assert own == {threading.get_ident()}

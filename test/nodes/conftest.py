@@ -116,7 +116,7 @@ class World:
 
         wanted = {one.source: (name, one) for name, one in self.node._heard.items()}
         name, one = wanted[source]
-        self.node._hear(name, received(data, one))
+        self.node._enqueue(name, received(data, one))
 
     def limit(self, source):
         """Queue length of a source."""
@@ -305,9 +305,9 @@ def world_of(capfd, monkeypatch):
     def make(*arguments, **values):
         from hmt_ros.nodes import silent_topics
 
-        monkeypatch.setattr(silent_topics, 'SILENCE', 1e6)
+        monkeypatch.setattr(silent_topics, 'SILENCE_TIME', 1e6)
         worlds.append(World(capfd, *arguments, **values))
-        worlds[-1].patience = lambda s: monkeypatch.setattr(silent_topics, 'SILENCE', s)
+        worlds[-1].patience = lambda s: monkeypatch.setattr(silent_topics, 'SILENCE_TIME', s)
         return worlds[-1]
 
     yield make

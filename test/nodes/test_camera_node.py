@@ -235,8 +235,8 @@ class Webcam:
 
 def test_a_webcam_that_is_plugged_in_again_goes_on(monkeypatch):
     monkeypatch.setattr(camera_node.cv2, 'VideoCapture', Webcam)
-    monkeypatch.setattr(camera_node, '_PATIENCE', 0.1)
-    monkeypatch.setattr(camera_node, '_REOPENED', 0.01)
+    monkeypatch.setattr(camera_node, '_UNPLUGGED_TIME', 0.1)
+    monkeypatch.setattr(camera_node, '_REOPENING_INTERVAL', 0.01)
     video, lines = camera_node.Video('/dev/video2'), []
     stopped = threading.Event()
     images = video.images(stopped, lines.append)

@@ -9,7 +9,7 @@ import pytest
 
 from hmt_ros.nodes import estimating_thread
 from hmt_ros.nodes.estimating_thread import (
-    SHARED,
+    MAX_SHARED_IMAGES,
     Arrived,
     EstimatingThreads,
     Estimator,
@@ -96,7 +96,7 @@ class Busy:
     def serve(self, name, place, *, later=False):
         return Estimator(
             self.session(name), self.threads.later if later else self.threads.poses, place=place,
-            tell=lambda handled: None, tell_change=lambda: None, tell_error=pytest.fail,
+            report=lambda handled: None, report_change=lambda: None, report_error=pytest.fail,
         )  # fmt: skip
 
     def until(self, *turns):
@@ -123,7 +123,7 @@ def busy():
 
 
 def test_turns_go_round_and_what_can_wait_waits(busy, monkeypatch):
-    monkeypatch.setattr(estimating_thread, 'LONGEST_WAIT', PATIENCE)
+    monkeypatch.setattr(estimating_thread, 'MAX_WAIT', PATIENCE)
     later = busy.serve('later', 0, later=True)
     second, first = busy.serve('second', 2), busy.serve('first', 1)
     send(first, 1)
@@ -145,7 +145,7 @@ def test_turns_go_round_and_what_can_wait_waits(busy, monkeypatch):
 
 
 def test_what_can_wait_does_not_wait_for_ever(busy, monkeypatch):
-    monkeypatch.setattr(estimating_thread, 'LONGEST_WAIT', 0.05)
+    monkeypatch.setattr(estimating_thread, 'MAX_WAIT', 0.05)
     pose, later = busy.serve('pose', 0), busy.serve('later', 1, later=True)
     send(pose, 1)
     busy.until(('pose', 1))
@@ -181,7 +181,7 @@ def test_a_picture_is_decoded_once(small_camera):
     assert one.decode(message) is picture
     assert other.decode(message) is not picture
     # Later messages take its place.
-    for index in range(SHARED):
+    for index in range(MAX_SHARED_IMAGES):
         one.decode(small_camera.image(index))
     assert one.decode(message) is not picture
     broken = small_camera.image(0)

@@ -505,5 +505,5 @@ def test_a_clock_that_goes_back_is_an_error_for_a_while(
     level, text, _ = running.diagnosis()
     assert (level, text[:30]) == (2, 'the clock went back by 600 s: ')
     assert any('the clock went back by 600 s' in warning for warning in running.warnings())
-    monkeypatch.setattr(session_node, 'ALARM', 0.0)
+    monkeypatch.setattr(session_node, 'TIME_JUMP_ALARM_TIME', 0.0)
     assert not running.diagnosis()[1].startswith('the clock')

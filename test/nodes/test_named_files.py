@@ -20,7 +20,7 @@ from hmt_ros.nodes.filter_node import FilterNode
 from hmt_ros.nodes.node_parameters import file_folders
 from hmt_ros.nodes.patient_reader import PatientReader
 from hmt_ros.nodes.smoother_node import SmootherNode
-from hmt_ros.sessions.named_file import FILES, check_place
+from hmt_ros.sessions.named_file import FILE_PARAMETERS, check_place
 
 TOKENS = ('Xq7Secret', '4815162342', 'Zw9Hidden')
 KINDS = {
@@ -135,7 +135,7 @@ def test_usual_folders(tmp_path, monkeypatch):
     assert folders[-1] == str(tmp_path)
     assert '/' not in folders
     assert file_folders('/data:/more:') == ('/data', '/more')
-    for parameter, names in FILES.items():
+    for parameter, names in FILE_PARAMETERS.items():
         for name in names():
             check_place(parameter, name, ())
 
@@ -180,7 +180,7 @@ def test_a_slow_reader_is_not_waited_for():
 
     text, first = ask('a')
     assert text == 'the files are still being read: ask again later'
-    assert first == pytest.approx(patient_reader.LONGEST_WAIT, abs=0.2)
+    assert first == pytest.approx(patient_reader.MAX_WAIT, abs=0.2)
     assert len(turns) > 10
     # The time for checks is used up, so many requests do not block others.
     began = time.monotonic()
@@ -188,7 +188,7 @@ def test_a_slow_reader_is_not_waited_for():
         assert 'other files' in ask('b')[0]
         ask('a')
     spent = time.monotonic() - began
-    assert spent < 2 * patient_reader.LONGEST_WAIT
+    assert spent < 2 * patient_reader.MAX_WAIT
     assert threading.active_count() < 20
     free.set()
     wait_for([reader._asked[1]])

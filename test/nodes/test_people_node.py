@@ -24,7 +24,7 @@ def world(world_of, monkeypatch):
 
     monkeypatch.setattr(track_start, 'Tracker', Follower)
     monkeypatch.setattr(StubTracker, 'made', [])
-    monkeypatch.setattr('hmt_ros.nodes.people_node.STAYS_OPEN', 1)
+    monkeypatch.setattr('hmt_ros.nodes.people_node.CLOSING_PERIODS', 1)
 
     def make(camera, **values):
         inputs = {'camera_info': CameraInfo, 'detections': People2D, 'image': Image}

@@ -24,7 +24,7 @@ def together(stub_tracker, stub_predictor, background_file):
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.parameter import Parameter
 
-    from hmt_ros.nodes.person_node import USUAL, nodes_together
+    from hmt_ros.nodes.person_node import USUAL_NODES, nodes_together
 
     context = rclpy.Context()
     rclpy.init(context=context)
@@ -37,7 +37,7 @@ def together(stub_tracker, stub_predictor, background_file):
 
     def make(**more):
         overrides = [Parameter(k, value=v) for k, v in {**values, **more}.items()]
-        made.extend(nodes_together(USUAL, context=context, parameter_overrides=overrides))
+        made.extend(nodes_together(USUAL_NODES, context=context, parameter_overrides=overrides))
         executor = SingleThreadedExecutor(context=context)
         other = rclpy.create_node('other', context=context)
         for node in (*made, other):
@@ -192,9 +192,9 @@ def test_the_bytes_are_those_of_nodes_in_processes_of_their_own(together, small_
 
 
 def test_parameters_follow_from_who_is_there():
-    from hmt_ros.nodes.person_node import USUAL, used_of_each_other
+    from hmt_ros.nodes.person_node import USUAL_NODES, used_of_each_other
 
-    assert used_of_each_other(USUAL) == {
+    assert used_of_each_other(USUAL_NODES) == {
         'filter_node': {'use_predictions': True},
         'smoother_node': {},
         'bme_node': {'tracked_interval': 0.2},

@@ -17,11 +17,11 @@ from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.core import (
     BEHIND,
     COVER,
-    FEWEST,
     FLOW_SCALE,
     FLOW_SHARE,
     FLOW_SIGMA,
-    LEAST_FACING,
+    MIN_FACING,
+    MIN_POINTS,
     OUTLINE_SPACING,
     OUTLINE_TURN,
 )
@@ -318,7 +318,7 @@ def edges(
     channels = np.round(angle * (bins / np.pi)).astype(np.intp) % bins
     value, gradient = sample_distance(image_map, surface.pixels, channels)
     seen = surface.valid & ~surface.hidden
-    each = np.where(seen, term.weight / np.maximum(seen.sum(0), FEWEST), 0.0)
+    each = np.where(seen, term.weight / np.maximum(seen.sum(0), MIN_POINTS), 0.0)
     residual = np.where(seen, value / sigma, 0.0)
     rho, pull, curvature = geman_mcclure(residual, term.scale, each * factors[:, None])
     directions = _through(gradient / sigma, surface.projection)
@@ -338,7 +338,7 @@ def flow_energy(
     places += frames.origins[segments, :, batch].transpose(0, 2, 1)
     pixels, projection = camera.project_with_derivative(places.transpose(1, 0, 2))
     present = np.arange(len(segments))[:, None] < points.counts[which]
-    each = weight / np.maximum(points.counts[which], FEWEST)
+    each = weight / np.maximum(points.counts[which], MIN_POINTS)
     each = np.where(present & np.isfinite(pixels[0]), each, 0.0)
     pixels, projection = np.nan_to_num(pixels), np.nan_to_num(projection)
     start = points.pixels.transpose(2, 0, 1)  # (2, K, Q)
@@ -381,7 +381,7 @@ def seen_points(body: Body, camera: Camera, frames: Frames, points: int = 120) -
     places = frames.points(mesh.segments, mesh.vertices)
     normals = frames.directions(mesh.segments, mesh.normals)
     distance = np.sqrt((places * places).sum(1))
-    facing = -(places * normals).sum(1) > LEAST_FACING * distance
+    facing = -(places * normals).sum(1) > MIN_FACING * distance
     _, hidden = visibility(body, frames, places, mesh.parts)
     pixels = camera.project(places.transpose(0, 2, 1)).transpose(2, 0, 1)  # (2, V, K)
     inside = (pixels[0] >= 0) & (pixels[0] < camera.width)

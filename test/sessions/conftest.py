@@ -325,7 +325,7 @@ class StubPredictor:
 @pytest.fixture
 def stub_predictor(monkeypatch):
     monkeypatch.setattr(bme_session, 'load_predictor', lambda path: StubPredictor())
-    monkeypatch.setattr(bme_session, 'LEAST_HEIGHT', 10)  # images are small
+    monkeypatch.setattr(bme_session, 'MIN_HEIGHT', 10)  # images are small
     monkeypatch.setattr(StubPredictor, 'asked', [])
     monkeypatch.setattr(StubPredictor, 'intervals', [])
     monkeypatch.setattr(StubPredictor, 'fault', None)
@@ -444,7 +444,9 @@ class Likelihoods:
 @pytest.fixture(scope='session')
 def random_walk():
     """Makes the smoother use random walks at the bodies' rates as motion priors."""
-    return lambda body: LinearGaussianDynamics.random_walk(body.rates / smoother_session.LIVELINESS)
+    return lambda body: LinearGaussianDynamics.random_walk(
+        body.rates / smoother_session.DIFFUSION_FACTOR
+    )
 
 
 @pytest.fixture(scope='session')
@@ -476,4 +478,4 @@ def hri_msgs(tmp_path_factory):
 @pytest.fixture
 def few_wait(monkeypatch):
     """Limits the number of waiting images to `queue_size`."""
-    monkeypatch.setattr(camera_session, 'MOST_INCOMPLETE', 1)
+    monkeypatch.setattr(camera_session, 'MAX_INCOMPLETE_IMAGES', 1)

@@ -12,7 +12,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions import smoother_session
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
-from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
+from hmt_ros.sessions.fixed_frame import OPTICAL_TO_BODY, FixedFrame, upright
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.sessions.track_messages import TOPICS
@@ -36,7 +36,7 @@ from msg_tools.messages.states import transforms_message
 def camera_at(index):
     """Pose in odom of a camera that moves around the person, nods, and rolls a little."""
     turn = Rotation.from_euler('zyx', [0.25 * index, 0.1 * np.sin(index), 0.05]).as_matrix()
-    return Transform(turn @ FROM_OPTICAL, np.array([-3.0 + 0.4 * index, 0.2 * index, 1.2]))
+    return Transform(turn @ OPTICAL_TO_BODY, np.array([-3.0 + 0.4 * index, 0.2 * index, 1.2]))
 
 
 def transforms(stamp, index):
@@ -80,7 +80,9 @@ def test_poses_are_carried_over_exactly(body, mixture):
     # Positions in odom agree with those in the camera frame.
     camera = fixed.camera
     seen = body.joint_positions(mixture.means) @ camera.rotation.T + camera.translation
-    np.testing.assert_allclose(body.joint_positions(found.means) @ FROM_OPTICAL.T, seen, atol=1e-9)
+    np.testing.assert_allclose(
+        body.joint_positions(found.means) @ OPTICAL_TO_BODY.T, seen, atol=1e-9
+    )
     turn = fixed.motion.rotation
     before, after = body.joint_jacobians(mixture.means), body.joint_jacobians(found.means)
     # Velocities and covariances of the joints rotate with the frame.
@@ -102,7 +104,7 @@ def test_somebody_who_stands_is_far_from_the_poles(body, heading):
     pose[:, 2], pose[:, 3] = 4.0, np.radians(heading)
     one = GaussianMixture([1.0], pose, 1e-4 * np.eye(37)[None])
     for yaw in (0.0, 90.0, 200.0):
-        turn = Rotation.from_euler('z', yaw, degrees=True).as_matrix() @ FROM_OPTICAL
+        turn = Rotation.from_euler('z', yaw, degrees=True).as_matrix() @ OPTICAL_TO_BODY
         found, _ = FixedFrame('odom', Transform(turn, np.zeros(3))).placed(body, one)
         assert abs(found.means[0, 4]) < 0.1
         sigmas = np.sqrt(np.diagonal(found.covariances[0]))
@@ -116,7 +118,7 @@ def test_a_camera_that_turns_round_gives_no_jump(body):
     both = GaussianMixture([0.6, 0.4], pose, np.tile(1e-4 * np.eye(37), (2, 1, 1)))
     turn, found = 0.0, []
     for yaw in np.linspace(0.0, 3.0 * np.pi, 40):
-        rotation = Rotation.from_euler('z', yaw).as_matrix() @ FROM_OPTICAL
+        rotation = Rotation.from_euler('z', yaw).as_matrix() @ OPTICAL_TO_BODY
         fixed = FixedFrame('odom', Transform(rotation, np.zeros(3)), turn)
         found.append(fixed.placed(body, both)[0].means[:, 3])
         turn = fixed.turn_of(body, pose[0])
@@ -164,7 +166,7 @@ def test_messages_in_the_fixed_frame(session, small_camera, outputs, body):
             assert (seen.frame_id, found.frame_id) == ('lens', 'odom_optical')
             camera = camera_at(index)
             joints = seen.joint_positions @ camera.rotation.T + camera.translation
-            np.testing.assert_allclose(found.joint_positions @ FROM_OPTICAL.T, joints, atol=1e-9)
+            np.testing.assert_allclose(found.joint_positions @ OPTICAL_TO_BODY.T, joints, atol=1e-9)
             assert np.array_equal(found.identities, seen.identities)
             assert found.state is TrackState.TRACKING
     for index, (seen, found) in enumerate(
@@ -184,7 +186,7 @@ def test_messages_in_the_fixed_frame(session, small_camera, outputs, body):
         t for t in read(outputs, '/tf')[-1].transforms if t.child_frame_id == 'odom_optical'
     ]
     assert leads.header.frame_id == 'odom'
-    np.testing.assert_allclose(rotation_of(leads), FROM_OPTICAL, atol=1e-12)
+    np.testing.assert_allclose(rotation_of(leads), OPTICAL_TO_BODY, atol=1e-12)
 
 
 def test_what_has_no_place_is_not_published(session, small_camera, outputs):

@@ -128,7 +128,7 @@ def test_no_identity_is_used_twice(session, outputs, people):
 
 
 def test_people_who_are_gone_are_forgotten(session, outputs, people, monkeypatch):
-    monkeypatch.setattr(hri_session, '_REMEMBERED', 3)
+    monkeypatch.setattr(hri_session, '_MAX_REMEMBERED_PEOPLE', 3)
     one = session()
     one.take(P1, people(0))
     gone = people(0, 1, TrackState.NOBODY)
@@ -139,7 +139,7 @@ def test_people_who_are_gone_are_forgotten(session, outputs, people, monkeypatch
 
 
 def test_who_is_silent_is_not_tracked(session, outputs, people, small_camera, monkeypatch):
-    monkeypatch.setattr(hri_session, 'LONGEST_SILENCE', 0.5)
+    monkeypatch.setattr(hri_session, 'MAX_SILENCE', 0.5)
     one = session()
     one.take(CAMERA_INFO, small_camera.info(0))
     one.take(P1, people(0))

@@ -61,7 +61,7 @@ class Session(TrackingSession):
 def with_a_radio(monkeypatch):
     for module in (image_inputs, tracking_session):
         monkeypatch.setattr(module, 'INPUTS', (*INPUTS, UWB))
-    monkeypatch.setattr(inputs, 'RECORDED', (*inputs.RECORDED, UWB))
+    monkeypatch.setattr(inputs, 'RECORDED_INPUTS', (*inputs.RECORDED_INPUTS, UWB))
 
 
 def distance(camera, index, metres=2.5):

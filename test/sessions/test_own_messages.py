@@ -20,7 +20,7 @@ def test_each_message_comes_back_once():
 
 
 def test_what_never_comes_back_is_forgotten(monkeypatch):
-    monkeypatch.setattr(own_messages, '_MOST_OWN', 3)
+    monkeypatch.setattr(own_messages, '_MAX_OWN_MESSAGES', 3)
     own = OwnMessages()
     for k in range(5):
         own.sent(HEAD + bytes([k + 1]))

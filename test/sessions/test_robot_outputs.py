@@ -9,7 +9,7 @@ import pytest
 from hmt_ros.body import load_body
 from hmt_ros.body.keep_out import Capsules, reach_after
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame
+from hmt_ros.sessions.fixed_frame import OPTICAL_TO_BODY, FixedFrame
 from hmt_ros.sessions.robot_outputs import LastSeen, RobotOutputs
 from hmt_ros.sessions.transform_buffer import Transform
 from msg_tools.messages.headers import SECOND_NS
@@ -39,7 +39,7 @@ def seen(stamp, fixed=None):
 @pytest.fixture
 def robot():
     one = RobotOutputs()
-    one.tell(START, 'lens', FOUND, 3, 0.9, seen(START))
+    one.update(START, 'lens', FOUND, 3, 0.9, seen(START))
     return one
 
 
@@ -68,7 +68,7 @@ def test_a_person_who_is_seen_is_inside(robot):
 
 def test_who_is_lost_may_be_as_far_as_people_move(robot):
     before = robot.keep_out(0.99)
-    robot.tell(START + SECOND_NS // 2, 'lens', LOST, 3, 0.6)
+    robot.update(START + SECOND_NS // 2, 'lens', LOST, 3, 0.6)
     after = robot.keep_out(0.99)
     assert (after.state, after.unseen) == (LOST, 0.5)
     np.testing.assert_allclose(after.radii, before.radii + reach_after(0.5))
@@ -80,7 +80,7 @@ def test_who_is_lost_may_be_as_far_as_people_move(robot):
 
 
 def test_only_an_image_without_anybody_frees_the_space(robot):
-    robot.tell(START + SECOND_NS, 'lens', NOBODY, 3, 0.05)
+    robot.update(START + SECOND_NS, 'lens', NOBODY, 3, 0.05)
     assert (robot.keep_out(0.99).state, len(robot.keep_out(0.99).radii)) == (NOBODY, 0)
     # If the camera then stops, nothing is known about later times.
     assert robot.keep_out(0.99, silence=2.0).state is KeepOutState.STALE
@@ -89,17 +89,17 @@ def test_only_an_image_without_anybody_frees_the_space(robot):
 
 
 def test_a_fixed_frame_has_its_own_places():
-    camera = Transform(FROM_OPTICAL, np.array([10.0, 0.0, 1.5]))
+    camera = Transform(OPTICAL_TO_BODY, np.array([10.0, 0.0, 1.5]))
     fixed = FixedFrame('odom', camera)
     robot = RobotOutputs()
-    robot.tell(START, 'odom', FOUND, 1, 0.9, seen(START, fixed))
+    robot.update(START, 'odom', FOUND, 1, 0.9, seen(START, fixed))
     joints = BODY.joint_positions(seen(START).posterior.means)[0]
-    placed = joints @ FROM_OPTICAL.T + camera.translation
+    placed = joints @ OPTICAL_TO_BODY.T + camera.translation
     assert capsules(robot.keep_out(0.99)).contain(placed).all()
     assert robot.keep_out(0.99).frame_id == 'odom'
     forecast = robot.forecast(START)
     assert forecast.frame_id == 'odom_optical'
-    np.testing.assert_allclose(forecast.joint_positions[0] @ FROM_OPTICAL.T, placed, atol=1e-9)
+    np.testing.assert_allclose(forecast.joint_positions[0] @ OPTICAL_TO_BODY.T, placed, atol=1e-9)
 
 
 def test_forecasts_are_of_the_time_that_is_asked_for(robot):
@@ -108,7 +108,7 @@ def test_forecasts_are_of_the_time_that_is_asked_for(robot):
     assert found.stamp_ns == START + SECOND_NS // 5
     assert found.means[0, 0] - BODY.prior_mean[0] == pytest.approx(0.2)
     assert (found.track_id, found.identities.tolist()) == (3, [5])
-    robot.tell(START + SECOND_NS // 10, 'lens', LOST, 3, 0.5)
+    robot.update(START + SECOND_NS // 10, 'lens', LOST, 3, 0.5)
     assert robot.forecast(START + SECOND_NS // 5).state is TrackState.LOST
     for stamp in (START, START + 11 * SECOND_NS):
         with pytest.raises(ValueError, match='wanted a time from then to 10 s later, saw'):
@@ -119,7 +119,7 @@ def test_each_time_of_a_grid_is_told_of_once(robot):
     first = list(robot.due(100.0, 0.05))
     assert first == [START + 10_000_000 * k for k in range(1, 6)]
     assert list(robot.due(100.0, 0.05)) == []
-    robot.tell(START + 33_333_333, 'lens', FOUND, 3, 0.9, seen(START + 33_333_333))
+    robot.update(START + 33_333_333, 'lens', FOUND, 3, 0.9, seen(START + 33_333_333))
     # The grid is one of time, not of images.
     assert list(robot.due(100.0, 0.05)) == [START + 10_000_000 * k for k in (6, 7, 8)]
     assert list(robot.due(0.0, 0.05)) == []
@@ -129,7 +129,7 @@ def test_a_grid_need_not_be_of_whole_nanoseconds():
     robot, stamps = RobotOutputs(), []
     for i in range(300):
         stamp = START + round(i * SECOND_NS / 29.97)
-        robot.tell(stamp, 'lens', FOUND, 1, 0.9, seen(stamp))
+        robot.update(stamp, 'lens', FOUND, 1, 0.9, seen(stamp))
         due = list(robot.due(90.0, 0.1))
         assert all(stamp < each <= stamp + SECOND_NS // 10 for each in due)
         stamps += due

@@ -104,7 +104,7 @@ def test_only_evidence_is_kept():
 def test_a_window_is_refined_on_images(smoother, seen, likelihoods):
     told = []
     one = smoother(seen)
-    content = trajectory_mixture_of(one.smooth_span(tell=told.append))
+    content = trajectory_mixture_of(one.smooth_span(notify=told.append))
     assert told == ['motions are refined on 4 images']
     assert len(content.free_energy) >= 1
     plain = trajectory_mixture_of(smoother(seen, refine_on_images='never').smooth_span())
@@ -127,12 +127,12 @@ def test_a_window_is_refined_on_images(smoother, seen, likelihoods):
 def test_a_smoother_alone_says_that_it_has_no_images(smoother, seen):
     told = []
     one = smoother()
-    alone = one.smooth_span(tell=told.append)
+    alone = one.smooth_span(notify=told.append)
     assert 'smoothed without images: 4 of 4 are not kept, as the filter runs in another' in told[0]
     without = smoother(refine_on_images='never')
-    assert serialise(alone) == serialise(without.smooth_span(tell=told.append))
+    assert serialise(alone) == serialise(without.smooth_span(notify=told.append))
     assert told[1] == 'smoothed without images, as refine_on_images says'
-    smoother(seen[:3]).smooth_span(tell=told.append)
+    smoother(seen[:3]).smooth_span(notify=told.append)
     assert '1 of 4 are not kept' in told[2]
 
 

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from hmt_ros.sessions import camera_session
-from hmt_ros.sessions.camera_session import CAMERA_INFO, CAMERA_MOVED, IMAGE, MOST_INCOMPLETE
+from hmt_ros.sessions.camera_session import (
+    CAMERA_INFO,
+    CAMERA_MOVED_FAULT,
+    IMAGE,
+    MAX_INCOMPLETE_IMAGES,
+)
 from hmt_ros.sessions.tracking_parameters import FilterParameters
 from hmt_ros.sessions.tracking_session import TrackingSession
 from hmt_ros.tracking import Status
@@ -82,11 +87,11 @@ def test_a_moved_camera_is_told_once(one, small_camera, stub_tracker):
     stub_tracker.step = step
     assert [len(texts) for texts in handled] == [0, 0, 1, 0, 0, 1]
     assert handled[2][0].startswith(
-        f'{CAMERA_MOVED}: at the image of {small_camera.stamp(3)} ns the scene is 12 px away; fix '
-        'the camera, take background_file again'
+        f'{CAMERA_MOVED_FAULT}: at the image of {small_camera.stamp(3)} ns the scene is 12 px '
+        'away; fix the camera, take background_file again'
     )
     assert 'the scene is elsewhere' in handled[5][0]
-    assert one.state.trouble() == CAMERA_MOVED
+    assert one.state.trouble() == CAMERA_MOVED_FAULT
 
 
 @pytest.mark.parametrize(
@@ -120,11 +125,11 @@ def test_what_a_dropped_image_waited_for_is_known(stub_tracker, subject_file, sm
         subject_file=str(subject_file), use_keypoints=True, input_timeout=60.0
     )
     one = TrackingSession(parameters, lambda output: None)
-    for index in range(MOST_INCOMPLETE + 1):
+    for index in range(MAX_INCOMPLETE_IMAGES + 1):
         one.take(IMAGE, small_camera.image(index))
     assert one.state.held_up == 'a calibrated camera_info'
     one.take(CAMERA_INFO, small_camera.info())
-    first = MOST_INCOMPLETE + 1
+    first = MAX_INCOMPLETE_IMAGES + 1
     for index in range(first, first + 2):
         one.take(IMAGE, small_camera.image(index))
     assert one.state.held_up == 'keypoints'
@@ -138,7 +143,7 @@ def test_images_that_wait_have_a_limit_of_bytes(
     monkeypatch, stub_tracker, subject_file, small_camera
 ):
     one = TrackingSession(FilterParameters(subject_file=str(subject_file)), lambda output: None)
-    monkeypatch.setattr(camera_session, 'MOST_BYTES', 0)
+    monkeypatch.setattr(camera_session, 'MAX_INCOMPLETE_BYTES', 0)
     for index in range(3):
         one.take(IMAGE, small_camera.image(index))
     assert one.state.counts['dropped'] == 2  # the newest still waits

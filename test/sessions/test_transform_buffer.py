@@ -91,8 +91,8 @@ def test_a_frame_that_changes_its_parent(buffer):
 
 
 def test_memory_is_bounded(buffer, monkeypatch):
-    monkeypatch.setattr(transform_buffer, 'MOST_STAMPS', 50)
-    monkeypatch.setattr(transform_buffer, 'MOST_FRAMES', 3)
+    monkeypatch.setattr(transform_buffer, 'MAX_STAMPS', 50)
+    monkeypatch.setattr(transform_buffer, 'MAX_FRAMES', 3)
 
     def kept(frame):
         return len(buffer._frames[frame].places)

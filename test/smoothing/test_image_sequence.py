@@ -111,8 +111,10 @@ def test_of_changes_images_count_more_and_all_else_as_before(walk):
     changes = ImageSequence.of(sequence.images, STAMPS, of_changes=True)
     for t, (share, of_changes) in enumerate(zip(sequence.shares, changes.shares)):
         for name, errors in ERRORS.items():
-            lasting = errors.lasting(0.1 if t else np.inf) if name == 'image' else 1.0
-            assert of_changes[name] == pytest.approx(lasting * share[name])
+            persistence_ratio = (
+                errors.persistence_ratio(0.1 if t else np.inf) if name == 'image' else 1.0
+            )
+            assert of_changes[name] == pytest.approx(persistence_ratio * share[name])
     assert changes.shares[1]['image'] > sequence.shares[1]['image']
 
 

@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother, TrajectoryMixture
 from hmt_ros.smoothing.likelihood import counted
-from hmt_ros.smoothing.mixture_smoother import LONG
+from hmt_ros.smoothing.mixture_smoother import LONG_WINDOW
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.trajectory_refinement import refine
 from msg_tools import RosbagsMessages
@@ -222,7 +222,7 @@ def test_what_counts_of_an_observation_is_a_power_of_it():
 
 def test_parts_of_a_long_sequence_lead_to_the_same_optima(modes):
     """Refined first in parts that differ from the best path, or as a whole."""
-    mixtures = tuple(modes(2.0, times=LONG + 20))
+    mixtures = tuple(modes(2.0, times=LONG_WINDOW + 20))
     dynamics = LinearGaussianDynamics.random_walk([0.5, 0.5])
     sequence = ModeSequence(mixtures, dynamics, np.ones(len(mixtures) - 1))
     found = MixtureSmoother(dynamics, -9.0, 9.0, max_trajectories=9).optima(

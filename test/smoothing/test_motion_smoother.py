@@ -14,7 +14,7 @@ from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.inference.mode_chain import backward_weights
 from hmt_ros.smoothing import LinearGaussianDynamics, MotionSmoother, SlidingWindow, motion_smoother
 from hmt_ros.smoothing.motion_smoother import FirstStates, Past
-from hmt_ros.smoothing.trajectory_mixture import led_by_first
+from hmt_ros.smoothing.trajectory_mixture import weights_capped_by_first
 
 FAST = LinearGaussianDynamics.constant_velocity([2.0, 1.0], 0.8)
 UNEVEN = np.cumsum([0.0, 0.1, 0.05, 0.4, 0.1])
@@ -56,7 +56,7 @@ def test_errors_that_last_count_once(modes, chained, dense):
     ]
     mean, covariance = dense(counted, [0] * 5, FAST, np.diff(UNEVEN))
     np.testing.assert_allclose(found.states, mean[None], atol=1e-9)
-    wider = np.mean([LASTING.lasting(dt) for dt in intervals])
+    wider = np.mean([LASTING.persistence_ratio(dt) for dt in intervals])
     np.testing.assert_allclose(
         found.marginal(2).covariances[0], wider * covariance[2, :2, 2, :2], rtol=1e-8
     )
@@ -78,7 +78,7 @@ def test_modes_of_one_motion_are_one_gaussian_that_contains_them(chained, dense)
 
 def test_motions_have_the_weight_of_all_their_paths(modes, walk, chained, monkeypatch):
     """Each of several distant paths is a motion; with fewer motions weights still sum to one."""
-    monkeypatch.setattr(motion_smoother, 'LEAST', 0.0)
+    monkeypatch.setattr(motion_smoother, 'MIN_WEIGHT', 0.0)
     images = chained(modes(3.0, times=3), hops=0.2)
     found = MotionSmoother(walk, max_motions=27).smooth(images)
     assert len(found) > 8
@@ -299,4 +299,4 @@ def test_motions_weigh_what_the_modes_near_them_do(chained):
     ],
 )
 def test_the_first_component_leads(weights, wanted):
-    np.testing.assert_allclose(led_by_first(np.array(weights)), wanted, atol=1e-12)
+    np.testing.assert_allclose(weights_capped_by_first(np.array(weights)), wanted, atol=1e-12)

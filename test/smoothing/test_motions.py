@@ -8,10 +8,10 @@ import pytest
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.reduction import merged
 from hmt_ros.smoothing.motions import (
-    MOMENT,
-    MOST_APART,
-    SAME_MOTION,
-    SPAN,
+    MAX_SPAN_DISTANCE,
+    SAME_MOTION_DISTANCE,
+    SPAN_TIME,
+    SPANS_PER_MOMENT,
     evidence_of_motions,
     grouped,
     path_distances,
@@ -31,7 +31,7 @@ def by_definition(nodes, points, stamps):
     Also returns the mean over all spans, without a limit.
     """
     ages = [(stamps[-1] - stamp) * 1e-9 for stamp in stamps]
-    of_span = [int(np.floor(age / SPAN + 1e-3)) for age in ages]
+    of_span = [int(np.floor(age / SPAN_TIME + 1e-3)) for age in ages]
     result, means = np.zeros((2, len(nodes), len(nodes)))
     for a in range(len(nodes)):
         for b in range(len(nodes)):
@@ -45,9 +45,9 @@ def by_definition(nodes, points, stamps):
                 apart[span] = far
             means[a, b] = sum(apart.values()) / len(apart)
             oldest = max(apart)
-            for end in range(min(MOMENT - 1, oldest), oldest + 1):
-                some = [apart[s] for s in range(end - MOMENT + 1, end + 1) if s in apart]
-                some = [min(far, MOST_APART) for far in some]
+            for end in range(min(SPANS_PER_MOMENT - 1, oldest), oldest + 1):
+                some = [apart[s] for s in range(end - SPANS_PER_MOMENT + 1, end + 1) if s in apart]
+                some = [min(far, MAX_SPAN_DISTANCE) for far in some]
                 result[a, b] = max(result[a, b], sum(some) / max(len(some), 1))
     return result, means
 
@@ -98,24 +98,24 @@ def test_what_flickers_is_absorbed(images, away):
     for first in range(images % 5, images - 1):
         some = {first, first + 1}
         if away <= 0.15 or any(some < set(span) for span in newest):
-            assert two_paths(images, away, some) <= SAME_MOTION + 1e-12
+            assert two_paths(images, away, some) <= SAME_MOTION_DISTANCE + 1e-12
 
 
 @pytest.mark.parametrize('images', [16, 17, 18, 19, 60])
 def test_two_that_part_and_meet_again_are_two(images):
     """They differ by 150 mm for 0.3 s, at any time."""
     for first in range(images - 8):
-        assert two_paths(images, 0.15, range(first, first + 9)) > SAME_MOTION
+        assert two_paths(images, 0.15, range(first, first + 9)) > SAME_MOTION_DISTANCE
     # With a smaller constant difference they are one motion.
     assert (
         two_paths(images, 0.029, range(images))
-        <= SAME_MOTION
+        <= SAME_MOTION_DISTANCE
         < two_paths(images, 0.031, range(images))
     )
 
 
 def test_in_a_window_of_one_image_every_mode_is_a_motion():
-    assert two_paths(1, 0.031, {0}) > SAME_MOTION >= two_paths(1, 0.029, {0})
+    assert two_paths(1, 0.031, {0}) > SAME_MOTION_DISTANCE >= two_paths(1, 0.029, {0})
 
 
 def test_motions_are_numbered_by_weight_and_have_all_of_it():

@@ -10,7 +10,7 @@ import pytest
 from hmt_ros.body import load_body, resting_points
 from hmt_ros.body.ground_terms import sole_jacobians, sole_points
 from hmt_ros.body.resting_points import (
-    SLIP,
+    SLIP_VARIANCE,
     RestingPoints,
     _smoothed_chain,
     rest_probabilities,
@@ -97,11 +97,11 @@ def test_the_prior_costs_what_resting_points_slip(rng):
     prior = dynamics.prior(intervals)
     along = 1e-3 * rng.normal(size=(5, 2))
     covariances = np.tile(np.eye(2), (5, 1, 1))
-    held = POINT.held(prior, along, covariances, intervals)
+    held = POINT.constrained_prior(prior, along, covariances, intervals)
     rests = probabilities(POINT, along, covariances, intervals)
     states = rng.normal(size=(3, 5, 4))
     slips = np.diff(line(states[:, :, :2].reshape(-1, 2)).reshape(3, 5, 3), axis=1)
-    wanted = (rests[:, 0] * np.square(slips).sum(2) / (2.0 * SLIP * intervals)).sum(1)
+    wanted = (rests[:, 0] * np.square(slips).sum(2) / (2.0 * SLIP_VARIANCE * intervals)).sum(1)
     more = held.energy(states)[0] - prior.energy(states)[0]
     # Up to the normalisation constant of a Gaussian.
     np.testing.assert_allclose(more - more[0], wanted - wanted[0], rtol=1e-9)

@@ -21,7 +21,7 @@ from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
 from hmt_ros.tracking.prediction import dynamics_of, predicted_states
 from hmt_ros.tracking.settings import MAX_EXTRAPOLATION_TIME
-from hmt_ros.tracking.weighting import Continuity
+from hmt_ros.tracking.weighting import TransitionPrior
 
 FRAME = 100_000_000  # ns
 UP = np.array([0.0, -1.0, 0.0])
@@ -165,10 +165,10 @@ def test_ways_to_face_are_carried(body):
         for some in (modes[:2], carried[:2]):
             nothing = np.zeros(2)
             transitions = np.full((2, 2), -20.0)
-            continuity = Continuity(body, some.poses, nothing, 0.1)
+            transition_prior = TransitionPrior(body, some.poses, nothing, 0.1)
             found.append(
                 weigh_ways(
-                    some, continuity, continuity.joints, transitions, nothing, nothing,
+                    some, transition_prior, transition_prior.joints, transitions, nothing, nothing,
                     np.ones(2, dtype=np.bool_),
                 )[:2]
             )  # fmt: skip

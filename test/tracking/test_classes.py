@@ -19,8 +19,8 @@ from hmt_ros.body.mirror import (
 from hmt_ros.core import believed
 from hmt_ros.tracking.classes import first_facing, ways, weigh_ways
 from hmt_ros.tracking.hypotheses import Modes
-from hmt_ros.tracking.settings import FACING_VALID, MAX_FACING_NATS
-from hmt_ros.tracking.weighting import Continuity
+from hmt_ros.tracking.settings import FACING_VALIDITY, MAX_FACING_NATS
+from hmt_ros.tracking.weighting import TransitionPrior
 
 DT = 0.1
 REVERSALS = load_body('human37').symmetries['reversal']
@@ -65,9 +65,9 @@ def weigh(human32, both):
 
 def weighed(body, modes, predicted, poses, transitions, before, evidence, followed, dt):
     """Log weights of poses, and the poses as modes."""
-    continuity = Continuity(body, predicted, np.zeros(len(modes)), dt)
+    transition_prior = TransitionPrior(body, predicted, np.zeros(len(modes)), dt)
     log_weights, facing, _ = weigh_ways(
-        modes, continuity, body.joint_positions(poses), transitions, before,
+        modes, transition_prior, body.joint_positions(poses), transitions, before,
         np.asarray(evidence, dtype=float), np.asarray(followed),
     )  # fmt: skip
     return log_weights, begun(body, poses, facing)
@@ -114,7 +114,7 @@ def test_one_image_does_not_turn_the_track_about(human32, both, weigh):
     log_weights, modes = weigh(begun(human32, both, log_odds=-4.0), [22.0, 20.0])
     assert log_weights[0] > log_weights[1] + 1.0
     assert log_odds_of(modes) == pytest.approx(
-        REVERSALS.after(-4.0, DT) + believed(2.0, FACING_VALID)
+        REVERSALS.after(-4.0, DT) + believed(2.0, FACING_VALIDITY)
     )
 
 
@@ -129,13 +129,15 @@ def test_one_image_says_only_as_much_as_it_may_be_believed():
     for evidence in (-5.0, -0.3, 0.0, 0.3, 2.0):
         ratio = np.exp(evidence)
         wanted = np.log(
-            (FACING_VALID * ratio + 1.0 - FACING_VALID)
-            / (FACING_VALID + (1.0 - FACING_VALID) * ratio)
+            (FACING_VALIDITY * ratio + 1.0 - FACING_VALIDITY)
+            / (FACING_VALIDITY + (1.0 - FACING_VALIDITY) * ratio)
         )
-        assert believed(evidence, FACING_VALID) == pytest.approx(wanted)
-        assert believed(-evidence, FACING_VALID) == pytest.approx(-believed(evidence, FACING_VALID))
-    assert believed(1e6, FACING_VALID) == pytest.approx(logit(FACING_VALID))
-    assert believed(-np.inf, FACING_VALID) == pytest.approx(-logit(FACING_VALID))
+        assert believed(evidence, FACING_VALIDITY) == pytest.approx(wanted)
+        assert believed(-evidence, FACING_VALIDITY) == pytest.approx(
+            -believed(evidence, FACING_VALIDITY)
+        )
+    assert believed(1e6, FACING_VALIDITY) == pytest.approx(logit(FACING_VALIDITY))
+    assert believed(-np.inf, FACING_VALIDITY) == pytest.approx(-logit(FACING_VALIDITY))
 
 
 def test_seen_from_the_side_either_way_may_go_on(human32, both):
@@ -162,8 +164,8 @@ def test_a_person_who_turns_away_leads_the_track_along(human32, both, turned):
     before = turned(both[0], side)
     first = begun(human32, before, log_odds=-8.0)
     poses = np.concatenate([before, turned(both[0], side + step)])
-    continuity = Continuity(human32, before, np.zeros(1), 1.0)
-    transitions = continuity.log_transitions(human32.joint_positions(poses))
+    transition_prior = TransitionPrior(human32, before, np.zeros(1), 1.0)
+    transitions = transition_prior.log_transitions(human32.joint_positions(poses))
     assert transitions[0, 1] > -0.5
     log_weights, _ = weighed(
         human32, first, before, poses, transitions, np.zeros(2), [3.0, 0.0], KNOWN, 1.0

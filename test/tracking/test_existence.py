@@ -12,8 +12,8 @@ from hmt_ros.body.rasterisation import render_silhouettes
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.markov_chain import update
 from hmt_ros.tracking.existence import (
-    CHAIN,
-    GIVEN,
+    EXISTENCE_CHAIN,
+    GIVEN_PROBABILITY,
     Existence,
 )
 from hmt_ros.tracking.observer import View
@@ -29,7 +29,10 @@ NO_KEYPOINTS = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 def test_without_an_image_nobody_is_not_said():
     """For any duration, r stays far above the limit."""
     for dt in (1.0, 1e3, 1e9):
-        assert CHAIN.predict([1 - GIVEN, GIVEN], dt)[1] > 5 * ABSENT_PROBABILITY
+        assert (
+            EXISTENCE_CHAIN.predict([1 - GIVEN_PROBABILITY, GIVEN_PROBABILITY], dt)[1]
+            > 5 * ABSENT_PROBABILITY
+        )
 
 
 def test_against_the_bernoulli_filter_of_stone_soup():
@@ -47,8 +50,8 @@ def test_against_the_bernoulli_filter_of_stone_soup():
     dt, detected, clutter = 0.2, 0.9, 0.05
     predictor = BernoulliParticlePredictor(
         transition_model=None,
-        birth_probability=CHAIN.transition(dt)[0, 1],
-        survival_probability=CHAIN.transition(dt)[1, 1],
+        birth_probability=EXISTENCE_CHAIN.transition(dt)[0, 1],
+        survival_probability=EXISTENCE_CHAIN.transition(dt)[1, 1],
     )
     model = LinearGaussian(1, [0], np.array([[1.0]]))
     updater = BernoulliParticleUpdater(
@@ -56,7 +59,7 @@ def test_against_the_bernoulli_filter_of_stone_soup():
     )
     theirs, ours = 0.3, np.array([0.7, 0.3])
     for step, at in enumerate([0.1, 0.0, 5.0, 50.0, 50.0, -0.3, 1.0, 50.0]):
-        ours = CHAIN.predict(ours, dt)
+        ours = EXISTENCE_CHAIN.predict(ours, dt)
         theirs = predictor.estimate_existence(theirs)
         time = datetime(2020, 1, 1, tzinfo=timezone.utc) + timedelta(seconds=step * dt)
         # The particles are at the person's position.
@@ -89,13 +92,13 @@ def watched(film, human32, camera):
 
     def watch(views, rate=10.0, pose_of=lambda pose, _: pose, watching=None, first=0):
         if watching is None:
-            watching = Existence(GIVEN)
+            watching = Existence(GIVEN_PROBABILITY)
             stamp = round(first * SECOND / rate)
             watching.appearance.learn(views[0], stamp, human32, camera, film[0][first])
         found = []
         for i, view in enumerate(views, first):
             stamp = round(i * SECOND / rate)
-            watching.look(view._replace(stamp=stamp), human32)
+            watching.update(view._replace(stamp=stamp), human32)
             if watching.last.seen:
                 pose = pose_of(film[0][i % len(film[0])], i)
                 watching.appearance.learn(view, stamp, human32, camera, pose)
@@ -173,7 +176,7 @@ def test_images_that_show_nothing_say_nothing(film, watched, kind, background):
     r = watching.probability
     found, *_ = watched([view] * 3, watching=watching, first=6)
     assert watching.last.llr == 0.0
-    assert found[-1] == pytest.approx(CHAIN.predict([1 - r, r], 0.3)[1], abs=1e-9)
+    assert found[-1] == pytest.approx(EXISTENCE_CHAIN.predict([1 - r, r], 0.3)[1], abs=1e-9)
 
 
 def test_colours_are_asked_where_the_background_is_of_no_use(film, watched):
@@ -290,7 +293,7 @@ def test_a_detector_says_the_same_of_the_same_picture(waiting, human37, camera, 
         for i, image in enumerate(images):
             noisy = np.clip(image + rng.normal(0.0, 2.0, image.shape), 0, 255).astype(np.uint8)
             view = View(noisy, keypoints=seen, stamp=i * SECOND // 10)
-            existence.look(view, human37, waiting=waiting)
+            existence.update(view, human37, waiting=waiting)
         return existence.probability
 
     still = probability(20 * [thing])
@@ -313,4 +316,4 @@ def test_a_person_who_moves_is_there(film, watched):
     found, seen, watching = watched(bare_views(film, range(10)), 5.0)
     assert all(seen)
     assert found.min() > 0.95
-    assert 'motion' in watching.last.said
+    assert 'motion' in watching.last.log_ratios

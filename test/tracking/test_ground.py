@@ -152,7 +152,7 @@ def looked(estimator: GroundEstimator, *pitches: float | None) -> GroundEstimato
     for second, pitch in enumerate(pitches):
         grey = np.full((ROOM_CAMERA.height, ROOM_CAMERA.width, 3), 120, np.uint8)
         image = grey if pitch is None else drawn(room(), turn(np.radians(pitch), 0.0))
-        estimator.look(image, ROOM_CAMERA, 1_000_000_000 * second)
+        estimator.update_by_lines(image, ROOM_CAMERA, 1_000_000_000 * second)
     return estimator
 
 
@@ -179,9 +179,13 @@ def test_the_lines_of_the_scene_tell_the_vertical_and_the_track_no_more(body, re
 def test_a_vertical_that_jumps_is_believed_at_the_second_look():
     estimator = looked(GroundEstimator(), 5.0, 30.0)
     assert pitch_of(estimator) == pytest.approx(5.0, abs=1.0)
-    estimator.look(drawn(room(), turn(np.radians(30.0), 0.0)), ROOM_CAMERA, 1_500_000_000)
+    estimator.update_by_lines(
+        drawn(room(), turn(np.radians(30.0), 0.0)), ROOM_CAMERA, 1_500_000_000
+    )
     assert pitch_of(estimator) == pytest.approx(5.0, abs=1.0)  # too soon
-    estimator.look(drawn(room(), turn(np.radians(30.0), 0.0)), ROOM_CAMERA, 2_100_000_000)
+    estimator.update_by_lines(
+        drawn(room(), turn(np.radians(30.0), 0.0)), ROOM_CAMERA, 2_100_000_000
+    )
     assert pitch_of(estimator) == pytest.approx(30.0, abs=1.0)
 
 
@@ -224,7 +228,7 @@ def test_a_given_vertical_that_is_wrong_is_contradicted_and_followed():
     assert estimator.contradicted
     estimator.set_gravity([0.0, -1.0, 0.0])
     for second in (3, 5):
-        estimator.look(drawn(room(), np.eye(3)), ROOM_CAMERA, 1_000_000_000 * second)
+        estimator.update_by_lines(drawn(room(), np.eye(3)), ROOM_CAMERA, 1_000_000_000 * second)
     assert not estimator.contradicted
     assert pitch_of(estimator) == pytest.approx(0.0, abs=1.0)
 
@@ -236,7 +240,7 @@ def test_a_camera_on_its_side_sees_the_lines_of_an_upright_one(degrees):
     estimator = GroundEstimator(KnownGround(up))
     for second in range(2):
         image = drawn(room(), rolled @ upright)
-        estimator.look(image, ROOM_CAMERA, 1_000_000_000 * second)
+        estimator.update_by_lines(image, ROOM_CAMERA, 1_000_000_000 * second)
     assert not estimator.contradicted
     assert degrees_between(estimator.estimate.up, up) < 1.0
     assert np.degrees(estimator.estimate.up_sigma) < 1.5  # the lines agree
@@ -253,15 +257,15 @@ def test_the_person_tells_a_camera_that_hangs_from_an_accelerometer(hangs):
     names = ('left_shoulder', 'right_shoulder', 'left_hip', 'right_hip')
     estimator = GroundEstimator(KnownGround(np.array([0.0, 1.0, 0.0])))
     assert not estimator.reversed
-    estimator.see(standing(names, down=not hangs))
+    estimator.update_sign_by_keypoints(standing(names, down=not hangs))
     assert estimator.reversed != hangs
     assert estimator.estimate.up == pytest.approx([0.0, 1.0 if hangs else -1.0, 0.0])
     # Half a trunk is no evidence, and gravity that points down in the image is kept.
     half = GroundEstimator(KnownGround(np.array([0.0, 1.0, 0.0])))
-    half.see(standing(names[1:], down=True))
+    half.update_sign_by_keypoints(standing(names[1:], down=True))
     assert not half.reversed
     usual = GroundEstimator(KnownGround(np.array([0.0, -1.0, 0.0])))
-    usual.see(standing(names, down=False))
+    usual.update_sign_by_keypoints(standing(names, down=False))
     assert not usual.reversed
 
 

@@ -14,7 +14,7 @@ from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.terms.keypoints import KEYPOINTS, Keypoints
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking import Tracker, TrackerSettings
-from hmt_ros.tracking.landmark_offsets import PRIOR, LandmarkOffsets
+from hmt_ros.tracking.landmark_offsets import OFFSET_SIGMA, LandmarkOffsets
 
 BODY = load_body('human37')
 CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
@@ -79,7 +79,7 @@ def test_a_second_counts_the_same_at_every_rate(poses):
             often = often.after(shown, BODY, CAMERA, pose, DT / 3)
     np.testing.assert_allclose(often.precision, known.precision, rtol=0.05, atol=10.0)
     first = after(poses[:1])
-    assert np.abs(first.offsets).max() < PRIOR
+    assert np.abs(first.offsets).max() < OFFSET_SIGMA
 
 
 def test_keypoints_that_are_elsewhere_tell_nothing(poses):

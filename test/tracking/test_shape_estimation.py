@@ -122,25 +122,31 @@ def toy(body, seed, noise=2e-3, measurements=120, pose_size=6):
     return Toy(body, by_shape, by_pose, measured), true
 
 
-def update(estimate, pose, trust=1.0):
+def update(estimate, pose, image_share=1.0):
     """One update from one mode with the energy of the toy."""
     gradient = estimate.by_pose.T @ estimate.error(pose) + pose
     covariance = np.linalg.inv(estimate.hessian())
     return estimate.update(
-        None, None, pose[None], np.ones(1), gradient[None], covariance[None], trust=trust
+        None,
+        None,
+        pose[None],
+        np.ones(1),
+        gradient[None],
+        covariance[None],
+        image_share=image_share,
     )
 
 
-@pytest.mark.parametrize('trust', [1.0, 0.35])
+@pytest.mark.parametrize('image_share', [1.0, 0.35])
 @pytest.mark.parametrize('start', [0.0, 0.1])
-def test_an_update_is_joint_least_squares_of_shape_and_pose(human37, trust, start):
+def test_an_update_is_joint_least_squares_of_shape_and_pose(human37, image_share, start):
     """For any linearisation point of the pose, because the measurements are linear."""
     estimate, _ = toy(human37, 0)
     d = estimate.by_pose.shape[1]
     prior = np.linalg.inv(estimate.covariance)
     size = len(prior)
-    update(estimate, np.full(d, start), trust)
-    root = np.sqrt(trust * ERRORS['shape'].together(trust))
+    update(estimate, np.full(d, start), image_share)
+    root = np.sqrt(image_share * ERRORS['shape'].together(image_share))
     rows = np.block(
         [
             [root * estimate.by_shape, root * estimate.by_pose],
@@ -159,7 +165,7 @@ def test_information_only_shrinks_what_is_not_known(human37):
     estimate, _ = toy(human37, 2)
     for _ in range(3):
         before = estimate.covariance
-        update(estimate, np.zeros(human37.dimension), trust=0.2)
+        update(estimate, np.zeros(human37.dimension), image_share=0.2)
         after = estimate.covariance
         assert np.array_equal(after, after.T)
         assert np.linalg.eigvalsh(after)[0] > 0
@@ -173,7 +179,7 @@ def test_many_images_tell_no_more_than_their_common_error_lets_them(human37):
     gained = []
     for more in (1, 9, 990):
         for _ in range(more):
-            update(estimate, np.zeros(human37.dimension), trust=0.2)
+            update(estimate, np.zeros(human37.dimension), image_share=0.2)
         gained.append(np.trace(np.linalg.inv(estimate.covariance) - prior))
     c = ERRORS['shape'].constant
     wanted = [0.2 * n / (1.0 + 0.2 * c * n) for n in (1, 10, 1000)]
@@ -281,7 +287,7 @@ def test_gradient_and_covariance_of_poses_that_give_way(human37, poses, observat
     near[1, elbow] = human37.upper[elbow]
     energy = posterior.fit(near, observation).energy
     gradient, hessian = energy.derivatives()
-    found, covariances = posterior.fit(near, observation).given_way
+    found, covariances = posterior.fit(near, observation).free_response
     held = np.diagonal(covariances, axis1=1, axis2=2) == 0
     assert not found[held].any()
     assert np.allclose(found[~held], gradient[~held])
@@ -306,10 +312,10 @@ def fitted(model, person, poses, rounds=2):
         for pose, image in zip(poses, seen(person, poses)):
             posterior = Posterior(estimate.body, CAMERA, settings)
             pose = posterior.minimise(posterior.of_image(image), pose[None], 6).x
-            gradients, covariances = posterior.fit(pose, image).given_way
+            gradients, covariances = posterior.fit(pose, image).free_response
             estimate.update(
                 posterior.likelihood, image, pose, np.ones(1), gradients, covariances,
-                trust=0.35,
+                image_share=0.35,
             )  # fmt: skip
     return estimate
 
@@ -355,8 +361,8 @@ def test_lengths_come_nearer_to_the_true_ones_with_keypoints(human37, poses):
         image = Observation(keypoints=exact_keypoints(person, pose))
         pose = posterior.minimise(posterior.of_image(image), pose[None], 6).x
         estimate.update(
-            posterior.likelihood, image, pose, np.ones(1), *posterior.fit(pose, image).given_way,
-            trust=0.35,
+            posterior.likelihood, image, pose, np.ones(1),
+            *posterior.fit(pose, image).free_response, image_share=0.35,
         )  # fmt: skip
     for name, true in long.items():
         before = true - human37.segment_lengths[name]
@@ -366,8 +372,8 @@ def test_lengths_come_nearer_to_the_true_ones_with_keypoints(human37, poses):
 def test_what_is_considered_is_that_of_the_uncertain_shape(human37, poses, observation):
     posterior = Posterior(human37, CAMERA, TrackerSettings())
     estimate = ShapeEstimate(human37)
-    _, covariances = posterior.fit(poses[:2], observation).given_way
-    found = estimate.considered(posterior.likelihood, observation, poses[:2], covariances)
+    _, covariances = posterior.fit(poses[:2], observation).free_response
+    found = estimate.induced_covariances(posterior.likelihood, observation, poses[:2], covariances)
     for k in range(2):
         pose = poses[k : k + 1]
         (mixed,) = estimate.linearised(posterior.likelihood, observation, pose).mixed
@@ -377,7 +383,7 @@ def test_what_is_considered_is_that_of_the_uncertain_shape(human37, poses, obser
     before = np.trace(found, axis1=1, axis2=2)
     # A better known shape contributes less covariance.
     estimate.covariance = 0.25 * estimate.covariance
-    found = estimate.considered(posterior.likelihood, observation, poses[:2], covariances)
+    found = estimate.induced_covariances(posterior.likelihood, observation, poses[:2], covariances)
     assert np.trace(found, axis1=1, axis2=2) == pytest.approx(0.25 * before)
 
 
@@ -391,7 +397,7 @@ def test_keypoints_tell_nothing_of_the_size(human37, poses):
     n = len(pixels)
     seen = Keypoints(human37.joint_names, pixels, np.tile(9.0 * np.eye(2), (n, 1, 1)), np.ones(n))
     observation = Observation(keypoints=seen)
-    (gradient,), (covariance,) = posterior.fit(poses[:1], observation).given_way
+    (gradient,), (covariance,) = posterior.fit(poses[:1], observation).free_response
     estimate = ShapeEstimate(human37)
     found = estimate.linearised(posterior.likelihood, observation, poses[:1])
     linear = Linearised(*(x[0] for x in found))

@@ -117,7 +117,7 @@ def tracked(tall, camera, keypoints_of):
             posterior, _ = tracker.step(image, 100 * t * MS, depth=given[name])
             joints = tracker.estimate.body.joint_positions(posterior.means[:1])[0]
             errors.append(np.linalg.norm(joints - true[t], axis=1).mean())
-        assert tracker.estimate.validity.believes(DEPTH) == (name != 'shifted')
+        assert tracker.estimate.validity.is_trusted(DEPTH) == (name != 'shifted')
         found[name] = np.array(errors), posterior
     return found
 
@@ -157,7 +157,7 @@ def test_the_belief_comes_back(tall, camera):
     ):
         validity.predict(0.1)
         see(pose, depth, 0.1)
-        assert believed is None or validity.believes(DEPTH) == believed
+        assert believed is None or validity.is_trusted(DEPTH) == believed
     # One image does not change that.
     see(wrong, shifted, 1.0 / 30.0)
-    assert validity.believes(DEPTH)
+    assert validity.is_trusted(DEPTH)

@@ -30,7 +30,7 @@ from hmt_ros.tracking import (
 from hmt_ros.tracking.misfit import KEYPOINTS
 from hmt_ros.tracking.posterior import free_covariances
 from hmt_ros.tracking.settings import MAX_SIGMA
-from hmt_ros.tracking.validity import UNDECIDED
+from hmt_ros.tracking.validity import UNDECIDED_MISFITS
 
 ONLY_KEYPOINTS = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
 OFF = GroundSettings(0.0, 0.0)
@@ -378,7 +378,7 @@ def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion
     assert 5 <= found <= LOST_WITHIN
     assert seen == [tracking] * (found - 1) + [lost] + [tracking] * (len(seen) - found)
     assert max(misfits[:3]) < 0.1
-    assert min(misfits[3:found]) > UNDECIDED[KEYPOINTS]
+    assert min(misfits[3:found]) > UNDECIDED_MISFITS[KEYPOINTS]
     assert max(misfits[found:]) < 0.1
     assert min(errors[3:found]) > 0.08
     assert max(errors[found:]) < 0.065
@@ -496,7 +496,7 @@ def test_one_bad_image_is_forgiven(human32, started, black, motion, keypoints_of
             seen = Keypoints(seen.names, anywhere, seen.covariances, seen.confidences)
         posterior, _ = tracker.step(black, i * FRAME, seen)
         assert tracker.estimate.status is Status.TRACKING
-        assert (tracker.estimate.misfit > UNDECIDED[KEYPOINTS]) == (i == 3)
+        assert (tracker.estimate.misfit > UNDECIDED_MISFITS[KEYPOINTS]) == (i == 3)
     assert best_error(tracker.estimate.body, posterior, human32, motion[5]) < 0.07
 
 

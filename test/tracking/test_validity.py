@@ -21,18 +21,18 @@ from hmt_ros.tracking.settings import (
     VALIDITY_NATS,
 )
 from hmt_ros.tracking.validity import (
-    CHAIN,
     CHAINS,
     DEPTH,
     DETECTOR,
-    UNDECIDED,
+    UNDECIDED_MISFITS,
+    VALIDITY_CHAIN,
     ByKeypoints,
     Validity,
     evidence_of,
 )
 
 RECOVERS, FAILS = RATES['track and cues']
-RATE, USUAL = 30.0, CHAIN.usual[1]
+RATE, USUAL = 30.0, VALIDITY_CHAIN.usual[1]
 
 
 def whole(share, groups=1):
@@ -86,7 +86,7 @@ def test_images_are_those_of_a_hidden_markov_model():
 
 def test_what_measurements_say():
     few = Misfit(np.array([0.0, 1.0, 1.0]), np.array([0, 1, 100]))
-    undecided = UNDECIDED[KEYPOINTS]
+    undecided = UNDECIDED_MISFITS[KEYPOINTS]
     wanted = VALIDITY_NATS * np.array([0.0, (undecided - 1) / VALIDITY_COUNT, undecided - 1])
     assert evidence_of(KEYPOINTS, few, begun=False) == pytest.approx(wanted)
     # A correct mode may have a misplaced part.
@@ -106,7 +106,7 @@ def test_what_a_second_says_does_not_depend_on_the_rate(rate):
             seconds(each, {cue: whole(0.0)}, lambda v: False, r, longest=2.0)
         bad = {cue: whole(0.8), KEYPOINTS: whole(0.0, 3)}
         times = [
-            seconds(each, bad, lambda v, cue=cue: not v.believes(cue), r)
+            seconds(each, bad, lambda v, cue=cue: not v.is_trusted(cue), r)
             for each, r in ((validity, rate), (usual, RATE))
         ]
         assert times[0] == pytest.approx(times[1], abs=1.5 / min(rate, RATE))
@@ -121,10 +121,10 @@ def test_a_cue_is_believed_again_within_a_second(cue):
     fine = {other: whole(0.0, len(validity.cues[other]))}
     bad = {cue: whole(1.0, groups)} | fine
     seconds(validity, bad, lambda v: False, longest=10.0)
-    assert not validity.believes(cue)
+    assert not validity.is_trusted(cue)
     assert not validity.lost
     good = {cue: whole(0.0, groups)} | fine
-    assert seconds(validity, good, lambda v: v.believes(cue)) < 1.0
+    assert seconds(validity, good, lambda v: v.is_trusted(cue)) < 1.0
 
 
 def test_groups_fail_one_by_one():
@@ -167,8 +167,8 @@ def test_one_cue_that_is_explained_keeps_a_track(right, wrong):
     sizes = {name: len(p) for name, p in validity.cues.items()}
     misfits = {right: whole(0.1, sizes[right]), wrong: whole(1.0, sizes[wrong])}
     assert np.isnan(seconds(validity, misfits, lambda v: v.lost))
-    assert validity.believes(right)
-    assert not validity.believes(wrong)
+    assert validity.is_trusted(right)
+    assert not validity.is_trusted(wrong)
 
 
 @pytest.mark.parametrize('rate', [30.0, 10.0, 3.0])
@@ -179,13 +179,13 @@ def test_a_silhouette_that_keypoints_contradict_is_doubted(rate):
     seconds(validity, fine, lambda v: False, rate, longest=2.0)
     misfits = fine | {KEYPOINTS: whole(0.8, 3)}
     for i in range(max(round(rate), 4)):
-        if not validity.believes(SILHOUETTE):
+        if not validity.is_trusted(SILHOUETTE):
             break
         validity.predict(1.0 / rate)
         # The first image determines which cue left the person.
         alone = ByKeypoints(whole(0.0, 3), 2.0 if i == 0 else 0.0)
         validity.update(misfits, 1.0 / rate, alone)
-    assert not validity.believes(SILHOUETTE)
+    assert not validity.is_trusted(SILHOUETTE)
     assert validity.cues[KEYPOINTS].min() > 0.6
     assert validity.track > 0.9
 

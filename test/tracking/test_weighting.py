@@ -9,7 +9,7 @@ import pytest
 
 from hmt_ros.body.mirror import reverse_depth
 from hmt_ros.tracking.settings import END_NATS, TRANSITION_SPREAD, TRANSITION_TAILS
-from hmt_ros.tracking.weighting import Continuity, normalised, pooled_origins
+from hmt_ros.tracking.weighting import TransitionPrior, normalised, pooled_origins
 
 
 @pytest.fixture(scope='module')
@@ -46,22 +46,22 @@ def transition(body, pose, expected, all_poses, dt):
     return share(pose) / (sum(share(x) for x in all_poses) + np.exp(-END_NATS))
 
 
-def log_histories(continuity, poses):
+def log_histories(transition_prior, poses):
     """log w_k p(x_n | x_k), (K, N)."""
-    joints = continuity.body.joint_positions(poses)
-    return continuity.log_histories(joints, continuity.log_transitions(joints))
+    joints = transition_prior.body.joint_positions(poses)
+    return transition_prior.log_histories(joints, transition_prior.log_transitions(joints))
 
 
-def log_priors(continuity, poses):
+def log_priors(transition_prior, poses):
     """log sum_k w_k p(x_n | x_k), (N,)."""
-    return np.logaddexp.reduce(log_histories(continuity, poses), axis=0)
+    return np.logaddexp.reduce(log_histories(transition_prior, poses), axis=0)
 
 
 @pytest.mark.parametrize('dt', [0.01, 0.1, 3.0])
 def test_transitions_are_a_student_density_of_the_joints(human32, poses_near, dt):
     before, poses = poses_near(3, 1), poses_near(5, 2, 0.3)
     joints = human32.joint_positions(poses)
-    found = Continuity(human32, before, np.zeros(3), dt).log_transitions(joints)
+    found = TransitionPrior(human32, before, np.zeros(3), dt).log_transitions(joints)
     wanted = [[log_transition(human32, x, b, dt) for x in poses] for b in before]
     assert found == pytest.approx(np.array(wanted), abs=1e-9)
 
@@ -77,8 +77,8 @@ def test_weights_are_the_sum_over_all_paths(human32, poses_near):
     gaps = (0.1, 0.03, 0.4)
     log_weights = normalised(first - evidence[0])
     for t in range(1, images):
-        continuity = Continuity(human32, moved[t - 1], log_weights, gaps[t - 1])
-        log_weights = normalised(log_priors(continuity, poses[t]) - evidence[t])
+        transition_prior = TransitionPrior(human32, moved[t - 1], log_weights, gaps[t - 1])
+        log_weights = normalised(log_priors(transition_prior, poses[t]) - evidence[t])
     wanted = np.zeros(count)
     for path in itertools.product(range(count), repeat=images):
         share = np.exp(first[path[0]] - evidence[0, path[0]])
@@ -99,15 +99,15 @@ def test_a_mode_without_continuation_ends(human32, poses_near):
     dt = 1e-4
     apart = log_transition(human32, near[0], far[0], dt)
     assert apart < -END_NATS - 1.0
-    continuity = Continuity(human32, both, np.log([0.5, 0.5]), dt)
-    left = np.exp(log_priors(continuity, near))
+    transition_prior = TransitionPrior(human32, both, np.log([0.5, 0.5]), dt)
+    left = np.exp(log_priors(transition_prior, near))
     stayed = 1.0 / (1.0 + np.exp(-END_NATS))
     crossed = np.exp(apart) / (np.exp(apart) + np.exp(-END_NATS))
     assert left == pytest.approx(0.5 * (stayed + crossed), rel=1e-6)
     # The mode without a continuation loses most of its mass.
     assert crossed < np.exp(apart + END_NATS) < 0.3
     # With a continuation for each mode, nearly nothing is lost.
-    assert np.exp(log_priors(continuity, both)).sum() > 0.98
+    assert np.exp(log_priors(transition_prior, both)).sum() > 0.98
 
 
 @pytest.mark.parametrize('copies', [2, 10, 100])
@@ -119,12 +119,14 @@ def test_copies_of_a_continuation_do_not_multiply_the_mass_of_a_mode(human32, po
     near[:, 7:] += 1e-4 * np.random.default_rng(0).normal(size=near[:, 7:].shape)
     near = np.clip(near, human32.lower, human32.upper)
     dt = 1e-5
-    continuity = Continuity(human32, np.concatenate([a, b]), np.log([0.7, 0.3]), dt)
-    weights = np.exp(log_priors(continuity, np.concatenate([a, near])))
+    transition_prior = TransitionPrior(human32, np.concatenate([a, b]), np.log([0.7, 0.3]), dt)
+    weights = np.exp(log_priors(transition_prior, np.concatenate([a, near])))
     assert weights[0] == pytest.approx(0.7, rel=0.02)
     assert weights[1:].sum() == pytest.approx(0.3, rel=0.1)
     # Each alone would have the whole weight of the mode.
-    assert np.exp(continuity.rated(human32.joint_positions(near))) == pytest.approx(0.3, rel=0.1)
+    assert np.exp(transition_prior.log_predictive(human32.joint_positions(near))) == pytest.approx(
+        0.3, rel=0.1
+    )
 
 
 def test_copies_of_a_motion_draw_no_weight_from_another(human32, poses_near):
@@ -136,24 +138,24 @@ def test_copies_of_a_motion_draw_no_weight_from_another(human32, poses_near):
     poses = np.concatenate([a[None], copies])
     weights = np.concatenate([[0.5], np.full(7, 0.5 / 7)])
     for _ in range(30):
-        continuity = Continuity(human32, poses, np.log(weights), dt)
-        weights = np.exp(normalised(log_priors(continuity, poses)))
+        transition_prior = TransitionPrior(human32, poses, np.log(weights), dt)
+        weights = np.exp(normalised(log_priors(transition_prior, poses)))
     assert weights[0] == pytest.approx(0.5, abs=0.1)
     # Transitions between the two are possible.
-    ways = np.exp(log_histories(continuity, poses) - np.log(weights)[:, None])
+    ways = np.exp(log_histories(transition_prior, poses) - np.log(weights)[:, None])
     assert ways[0, 1:].sum() > 0.01
 
 
 @pytest.mark.parametrize('dt', [1e-9, 1000.0])
 def test_gaps_of_any_length_give_finite_numbers(human32, poses_near, dt):
     before, poses = poses_near(3, 1), poses_near(4, 2, 1.0)
-    continuity = Continuity(human32, before, np.log([0.9, 0.1, 1e-6]), dt)
-    rated = continuity.rated(human32.joint_positions(poses))
-    for found in (log_priors(continuity, poses), rated):
+    transition_prior = TransitionPrior(human32, before, np.log([0.9, 0.1, 1e-6]), dt)
+    log_predictive = transition_prior.log_predictive(human32.joint_positions(poses))
+    for found in (log_priors(transition_prior, poses), log_predictive):
         assert np.isfinite(found).all()
     if dt > 1.0:
         # After a long time every pose continues every mode equally.
-        assert np.exp(log_priors(continuity, poses)) == pytest.approx(0.25, rel=0.02)
+        assert np.exp(log_priors(transition_prior, poses)) == pytest.approx(0.25, rel=0.02)
 
 
 def test_origins_of_modes_that_stand_for_several():

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, run_command
-from hmt_ros.app.progress import tell_user
+from hmt_ros.app.progress import notify_user
 from hmt_ros.app.replay.inputs import recorded_input
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
@@ -182,7 +182,7 @@ def _track(source: Path, target: Path, options: ReplayOptions, inputs: str) -> f
     """Tracks the person; returns poses per second."""
     print(f'tracking the person in {source} by {inputs}', flush=True)
     start = time.monotonic()
-    replayed = replay_bag(source, target, options, partial(tell_user, 'replay'))
+    replayed = replay_bag(source, target, options, partial(notify_user, 'replay'))
     spent = time.monotonic() - start
     print(f'{replayed} in {spent:.1f} s', flush=True)
     with BagReader(target) as bag:

@@ -26,14 +26,14 @@ from hmt_ros.app.command_line import (
     whole_number,
 )
 from hmt_ros.app.import_video.frames import Frame, FrameSource, Masks, Selection, open_source
-from hmt_ros.app.import_video.keypoint_files.choice import LARGEST, NEAREST, Choice
+from hmt_ros.app.import_video.keypoint_files.choice import BY_DISTANCE, BY_SIZE, Choice
 from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons
 from hmt_ros.app.import_video.keypoint_files.reading import (
     ClipReading,
     keypoints_of_person,
     read_keypoints,
 )
-from hmt_ros.app.progress import Tell, say, tell_user, with_progress
+from hmt_ros.app.progress import Notify, notify_user, say, with_progress
 from hmt_ros.body import Camera
 from hmt_ros.detectors.detector import Detector
 from hmt_ros.detectors.people import PeopleDetector, SeenPerson
@@ -42,7 +42,7 @@ from hmt_ros.image.keypoint_schemes import AUTO
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.sessions.camera_file import camera_of_view, read_camera
-from hmt_ros.sessions.keypoints_session import MOST_PEOPLE, detected_people
+from hmt_ros.sessions.keypoints_session import MAX_PEOPLE, detected_people
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.detections import NO_KEYPOINTS, people_message
@@ -193,7 +193,7 @@ def add_video_arguments(parser: CommandParser, *, camera_required: bool = True) 
     )
     found.add_argument(
         '--people',
-        type=whole_number(1, MOST_PEOPLE),
+        type=whole_number(1, MAX_PEOPLE),
         metavar='N',
         help=f'follow up to N people with {DETECTORS[USUAL_DETECTOR].title}, for replay --people',
     )
@@ -257,14 +257,14 @@ def person_choice(text: str) -> Choice:
 
 
 def _import(arguments: argparse.Namespace) -> int:
-    tell = partial(tell_user, 'import-video')
-    imported = import_video(arguments, tell)
+    notify = partial(notify_user, 'import-video')
+    imported = import_video(arguments, notify)
     if not arguments.quiet:
         say(f'{arguments.output}: {imported}')
     return 0
 
 
-def import_video(options: argparse.Namespace, tell: Tell) -> Imported:
+def import_video(options: argparse.Namespace, notify: Notify) -> Imported:
     """Writes a video into a new bag, completely or not at all.
 
     Args:
@@ -282,13 +282,13 @@ def import_video(options: argparse.Namespace, tell: Tell) -> Imported:
     selection = Selection(options.start, options.end, options.every)
     source = open_source(options.source, options.fps, options.first_number)
     for note in source.notes:
-        tell(note)
+        notify(note)
     masks = None if options.masks is None else Masks(options.masks, source)
     found = None
     if options.keypoints is not None:
         found = read_keypoints(options.keypoints, source, options.first_stamp)
     with ExitStack() as opened:
-        see = _seer(options, source, found, masks, tell)
+        see = _seer(options, source, found, masks, notify)
         writer = opened.enter_context(BagWriter(options.output, overwrite=options.overwrite))
         frames = opened.enter_context(closing(_same_size(source, selection, options.mirror)))
         counted = with_progress(
@@ -296,15 +296,15 @@ def import_video(options: argparse.Namespace, tell: Tell) -> Imported:
         )
         shown = opened.enter_context(closing(counted))
         lifts = options.detector is not None or (found is not None and found.lifts)
-        result = _write(writer, options, shown, see, lifts, tell)
+        result = _write(writer, options, shown, see, lifts, notify)
         if not result.images:
             raise ValueError(
                 f'{options.source}: no frame was read'
                 + (f' of {source.count}; see --start and --end' if source.count else '')
             )
-        _check_ends(options, source, found, masks, tell)
+        _check_ends(options, source, found, masks, notify)
         if found is not None:
-            _check_keypoints(options, result, found, tell)
+            _check_keypoints(options, result, found, notify)
         if masks is not None and not result.with_masks:
             raise ValueError(
                 f'{options.masks}: no mask belongs to one of the {result.images} imported frames; '
@@ -328,7 +328,7 @@ def _seer(
     source: FrameSource,
     found: FoundPersons | None,
     masks: Masks | None,
-    tell: Tell,
+    notify: Notify,
 ) -> Seer:
     """Returns a function that maps a frame and its stamp to keypoints and mask."""
     chosen: dict[int, Keypoints] | None = None
@@ -352,7 +352,9 @@ def _seer(
         if chosen is None:
             height, width = frame.image.shape[:2]
             first = frame.time_ns if found.timed else frame.number
-            chosen = keypoints_of_person(found, reading, (width, height), tell, first, source.rate)
+            chosen = keypoints_of_person(
+                found, reading, (width, height), notify, first, source.rate
+            )
         key = found.key_of(frame)
         return None if key is None else chosen.get(key), mask
 
@@ -423,12 +425,12 @@ def _same_size(
 def camera_of(
     options: argparse.Namespace,
     size: tuple[int, int],
-    tell: Tell,
+    notify: Notify,
     aspect: float = 1.0,
 ) -> Camera:
     """Camera from the command line options, for images of the given size."""
     if options.camera is not None:
-        return read_camera(options.camera, size, tell)
+        return read_camera(options.camera, size, notify)
     return camera_of_view(size, options.fov, options.vertical_fov, aspect)
 
 
@@ -438,7 +440,7 @@ def _write(
     frames: Iterable[Frame],
     see: Seer,
     lifts: bool,
-    tell: Tell,
+    notify: Notify,
 ) -> Imported:
     """Writes the frames one by one; only one frame is in memory at a time.
 
@@ -454,7 +456,7 @@ def _write(
         result.with_masks = 0
     for frame in frames:
         height, width = frame.image.shape[:2]
-        camera = camera or camera_of(options, (width, height), tell, frame.aspect)
+        camera = camera or camera_of(options, (width, height), notify, frame.aspect)
         stamp = options.first_stamp + frame.time_ns
         jpeg = frame.jpeg or encode_jpeg(frame.image, options.jpeg_quality)
         bag.write(IMAGE, stamp, jpeg_message(messages, jpeg, stamp, FRAME_ID))
@@ -485,7 +487,7 @@ def _check_ends(
     source: FrameSource,
     found: FoundPersons | None,
     masks: Masks | None,
-    tell: Tell,
+    notify: Notify,
 ) -> None:
     """Checks that the numbers of frames, keypoints and masks agree, if all frames were read.
 
@@ -495,7 +497,7 @@ def _check_ends(
         return
     count, claimed = source.count, source.claimed
     if claimed > count:
-        tell(
+        notify(
             f'{source.path}: {count} of the {claimed} frames that its header announces can be '
             'read; keypoints and masks of later frames may belong to other frames'
         )
@@ -517,7 +519,7 @@ def _check_ends(
 
 
 def _check_keypoints(
-    options: argparse.Namespace, result: Imported, found: FoundPersons, tell: Tell
+    options: argparse.Namespace, result: Imported, found: FoundPersons, notify: Notify
 ) -> None:
     """Checks that imported images have keypoints; raises ValueError or notifies the user."""
     if not result.with_keypoints and any(found.persons()):
@@ -525,6 +527,6 @@ def _check_keypoints(
             f'{options.keypoints}: none of the {result.images} imported frames has keypoints of '
             'the chosen person; see --person and --first-number'
         )
-        if options.person.kind not in (LARGEST, NEAREST):
+        if options.person.kind not in (BY_SIZE, BY_DISTANCE):
             raise ValueError(text)
-        tell(text)
+        notify(text)

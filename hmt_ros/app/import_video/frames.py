@@ -14,8 +14,8 @@ import numpy as np
 from hmt_ros.inference.arrays import Image, Mask
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.display_matrix import (
-    STORED,
-    TURNED,
+    IDENTITY,
+    ROTATIONS,
     display_matrix,
     is_mirrored,
     is_turned,
@@ -26,14 +26,17 @@ from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.images import decode_picture, decoded
 
 IMAGE_SUFFIXES = ('.jpg', '.jpeg', '.png', '.bmp', '.tif', '.tiff', '.webp', '.ppm', '.pgm')
-LARGEST_IMAGE_FILE = 2**28  # maximum size, bytes
-MOST = 1e9  # maximum number of frames; a larger number in the header is a sign of damage
-FASTEST = 1000.0  # maximum frames per second; a higher rate in the container is a sign of damage
-_EXIF_WITHIN = 2**16  # number of bytes at the start of a JPEG that are searched for Exif data
-_HALF = 127  # threshold of masks, grey levels
-_SQUAREST, _THINNEST = 0.99, 0.1  # limits of the aspect ratio of a pixel, shorter over longer side
+MAX_IMAGE_BYTES = 2**28  # maximum size, bytes
+MAX_FRAMES = 1e9  # maximum number of frames; a larger number in the header is a sign of damage
+MAX_FPS = 1000.0  # maximum frames per second; a higher rate in the container is a sign of damage
+_EXIF_BYTES = 2**16  # number of bytes at the start of a JPEG that are searched for Exif data
+_MASK_THRESHOLD = 127  # threshold of masks, grey levels
+_MAX_SIDE_RATIO, _MIN_SIDE_RATIO = (
+    0.99,
+    0.1,
+)  # limits of the aspect ratio of a pixel, shorter over longer side
 # OpenCV 4.6, which Ubuntu 24.04 ships, reports the rotation of a video with the wrong sign.
-_TURNS_BACKWARDS = cv2.__version__.startswith('4.6.')
+_HAS_REVERSED_ROTATION = cv2.__version__.startswith('4.6.')
 
 
 @dataclass(frozen=True)
@@ -177,7 +180,7 @@ class VideoFile(FrameSource):
         # Versions of OpenCV differ in whether and in which direction they rotate frames.
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         angle = round(self._capture.get(cv2.CAP_PROP_ORIENTATION_META))
-        turned = TURNED.get((-angle if _TURNS_BACKWARDS else angle) % 360, STORED)
+        turned = ROTATIONS.get((-angle if _HAS_REVERSED_ROTATION else angle) % 360, IDENTITY)
         self._matrix = display_matrix(path) or turned
         if is_mirrored(self._matrix):
             self.notes.append(
@@ -190,7 +193,11 @@ class VideoFile(FrameSource):
         if is_turned(self._matrix):
             across, down = down, across
         self._aspect = 1.0
-        if _THINNEST * max(across, down) < min(across, down) < _SQUAREST * max(across, down):
+        if (
+            _MIN_SIDE_RATIO * max(across, down)
+            < min(across, down)
+            < _MAX_SIDE_RATIO * max(across, down)
+        ):
             self._aspect = across / down
             self.notes.append(
                 f'{path}: pixels are {self._aspect:.3g} times as wide as high: frames are kept '
@@ -199,7 +206,7 @@ class VideoFile(FrameSource):
         self._fps = fps
         self.rate = fps or self._capture.get(cv2.CAP_PROP_FPS) or None
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        self.claimed = int(count) if 0 < count < MOST else 0
+        self.claimed = int(count) if 0 < count < MAX_FRAMES else 0
 
     def frames(self, selection: Selection) -> Iterator[Frame]:
         """See `FrameSource`."""
@@ -229,7 +236,7 @@ class VideoFile(FrameSource):
                 time_ns = round(self.count * SECOND_NS / self._fps)
             elif time_ns <= last:
                 # Times are 0 in containers without times, and can decrease in damaged containers.
-                if not 0 < fps <= FASTEST:
+                if not 0 < fps <= MAX_FPS:
                     raise ValueError(
                         f'{self.path} has neither timestamps nor a frame rate; give --fps'
                     )
@@ -275,7 +282,7 @@ class ImageFolder(FrameSource):
         """
         file = self._files[number]
         try:
-            content = read_bytes(file, LARGEST_IMAGE_FILE)
+            content = read_bytes(file, MAX_IMAGE_BYTES)
             image, jpeg = _upright(content)
         except ValueError as error:
             raise ValueError(f'{file}: {error}') from error
@@ -286,7 +293,7 @@ def _upright(content: bytes) -> tuple[Image, bytes | None]:
     """The upright image in a file, and the file content if it is a JPEG that needs no rotation."""
     if content.startswith(b'\xff\xd8\xff'):
         as_stored = decode_picture(content, 'jpeg')
-        if b'Exif\0' not in content[:_EXIF_WITHIN]:
+        if b'Exif\0' not in content[:_EXIF_BYTES]:
             return as_stored, content
         image = decoded(content)
         same = image.shape == as_stored.shape and np.array_equal(image, as_stored)
@@ -372,5 +379,5 @@ def mask_in(image: Image) -> Mask:
     A pixel is True if its brightest channel exceeds 127, or 0 in an image of zeros and ones.
     """
     brightest = image.max(2)
-    result: Mask = brightest > (_HALF if brightest.max() > 1 else 0)
+    result: Mask = brightest > (_MASK_THRESHOLD if brightest.max() > 1 else 0)
     return result

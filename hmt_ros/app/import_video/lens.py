@@ -16,23 +16,23 @@ from msg_tools.files.mp4_boxes import Data, boxes, boxes_at, mapped
 
 KEY = b'com.apple.quicktime.camera.focal_length.35mm_equivalent'
 # Width of a picture on 35 mm film, and range of plausible 35 mm equivalent focal lengths, mm.
-FILM, FOCAL_LENGTHS = 36.0, (6.0, 1200.0)
+FILM_WIDTH, FOCAL_LENGTH_LIMITS = 36.0, (6.0, 1200.0)
 # Relative standard deviation of a focal length from metadata, which do not include the cropping for
 # stabilisation and aspect ratio.
-TOLD_SIGMA = 0.1
+METADATA_FOV_SIGMA = 0.1
 # Type codes of values that are not integers.
-_TEXT, _FLOATS = 1, {23: '>f', 24: '>d'}
+_TEXT_TYPE, _FLOAT_TYPES = 1, {23: '>f', 24: '>d'}
 
 
-def told_fov(path: Path) -> float | None:
+def metadata_fov(path: Path) -> float | None:
     """The field of view along the longer side of the images, degrees; None if unknown."""
     with mapped(path) as data:
         try:
             focal = next(_focal_lengths(data), math.nan)
         except (ValueError, struct.error):
             return None
-    low, high = FOCAL_LENGTHS
-    return math.degrees(2.0 * math.atan(0.5 * FILM / focal)) if low <= focal <= high else None
+    low, high = FOCAL_LENGTH_LIMITS
+    return math.degrees(2.0 * math.atan(0.5 * FILM_WIDTH / focal)) if low <= focal <= high else None
 
 
 def _focal_lengths(data: Data) -> Iterator[float]:
@@ -54,6 +54,6 @@ def _focal_lengths(data: Data) -> Iterator[float]:
 def _number(value: bytes) -> float:
     """The number in a value, which consists of type, language and number."""
     kind, content = int.from_bytes(value[:4], 'big'), value[8:24]
-    if kind in _FLOATS:
-        return float(struct.unpack(_FLOATS[kind], content)[0])
-    return float(content) if kind == _TEXT else float(int.from_bytes(content, 'big'))
+    if kind in _FLOAT_TYPES:
+        return float(struct.unpack(_FLOAT_TYPES[kind], content)[0])
+    return float(content) if kind == _TEXT_TYPE else float(int.from_bytes(content, 'big'))

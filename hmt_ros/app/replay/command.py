@@ -16,8 +16,8 @@ from functools import partial
 from pathlib import Path
 
 from hmt_ros.app.command_line import CommandParser, run_command
-from hmt_ros.app.progress import say, tell_user
-from hmt_ros.app.replay.many_bags import is_many, replay_many
+from hmt_ros.app.progress import notify_user, say
+from hmt_ros.app.replay.many_bags import has_several_bags, replay_many
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import LOG_TIMES, STAMPS, ReplayOptions
 
@@ -200,12 +200,12 @@ def _namespace(text: str) -> str:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
-    values, tell = vars(arguments), partial(tell_user, 'replay')
+    values, notify = vars(arguments), partial(notify_user, 'replay')
     bags, output, scheduler = (values.pop(name) for name in ('bags', 'output', 'scheduler'))
     options = ReplayOptions(**values)
-    if is_many(bags, scheduler):
-        return replay_many(bags, output, options, tell, scheduler)
-    replayed = replay_bag(bags[0], output, options.of_bag(bags[0]), tell)
+    if has_several_bags(bags, scheduler):
+        return replay_many(bags, output, options, notify, scheduler)
+    replayed = replay_bag(bags[0], output, options.of_bag(bags[0]), notify)
     if not options.quiet:
         say(f'{output}: {replayed}')
     return 0

@@ -30,13 +30,13 @@ from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
 
 # Preferred names of the image topic.
-_USUAL = ('image/compressed', 'image')
+_USUAL_TOPICS = ('image/compressed', 'image')
 GROUND_TRUTH = 'ground_truth'
 # Inputs read from the bag; replay recomputes predictions.
-RECORDED = (*(row for row in INPUTS if row is not PREDICTION_INPUT), DETECTIONS_INPUT)
+RECORDED_INPUTS = (*(row for row in INPUTS if row is not PREDICTION_INPUT), DETECTIONS_INPUT)
 # Fixed frames with z up [REP 105], and maximum number of messages searched for such a frame.
 UPRIGHT_FRAMES = ('odom', 'map', 'world')
-_SEARCHED = 2000
+_MAX_SEARCHED_MESSAGES = 2000
 # Suffix of the topic with the filter's overlay images.
 OVERLAY = 'overlay/compressed'
 
@@ -74,8 +74,8 @@ class RecordedInput:
         return 'compressed' if compressed else 'raw'
 
     def of(self, name: str) -> Topic | None:
-        """Topic of the input with this name in `RECORDED`; None if the bag lacks it."""
-        row = next(row for row in RECORDED if row.name == name)
+        """Topic of the input with this name in `RECORDED_INPUTS`; None if the bag lacks it."""
+        row = next(row for row in RECORDED_INPUTS if row.name == name)
         return next((self.given[source] for source in row.types if source in self.given), None)
 
     def messages(self, bag: BagReader) -> Generator[tuple[str, BagMessage], None, None]:
@@ -123,22 +123,24 @@ def _scaled(stored: BagMessage, size: tuple[int, int]) -> BagMessage:
     return stored.with_message(camera_info_message(RosbagsMessages(), camera, stamp, frame))
 
 
-def fitted(bag: BagReader, recorded: RecordedInput, tell: Callable[[str], object]) -> RecordedInput:
+def fitted(
+    bag: BagReader, recorded: RecordedInput, notify: Callable[[str], object]
+) -> RecordedInput:
     """Returns the input, with `scaled` set if images and calibration differ in size."""
     messages = bag.messages([recorded.image.name])
     if recorded.video:
         messages = with_pictures(messages, recorded.image.name)
-    told: list[str] = []
+    notices: list[str] = []
     try:
         height, width = decode_image(next(messages).message).shape[:2]
         info = next(bag.messages([recorded.camera_info.name])).message
         camera = camera_from_info(info)
         if (camera.width, camera.height) == (width, height):
             return recorded
-        camera_from_info(info, (width, height), told.append)
+        camera_from_info(info, (width, height), notices.append)
     except (ValueError, StopIteration):
         return recorded  # the replay itself reports the fault
-    tell(f'{bag.path}: {told[-1]}')
+    notify(f'{bag.path}: {notices[-1]}')
     return replace(recorded, scaled=(width, height))
 
 
@@ -191,7 +193,7 @@ def recorded_input(
     """
     named = partial(_in_namespace, bag, namespace)
     given: dict[str, Topic] = {}
-    for row in RECORDED:
+    for row in RECORDED_INPUTS:
         types = {
             s: (tuple(SOURCES.values()) if s == DETECTIONS else (t,)) for s, t in row.types.items()
         }
@@ -205,7 +207,9 @@ def recorded_input(
                 given[source] = topic
                 break
     besides = [topic.name.lstrip('/') for topic in given.values()]
-    of_pixels = [source for row in RECORDED if row.pixels is not None for source in row.types]
+    of_pixels = [
+        source for row in RECORDED_INPUTS if row.pixels is not None for source in row.types
+    ]
     image = _image_topic(bag, image_topic, namespace, (*of_pixels, *besides))
     transforms = {source: _named(bag, source, (TRANSFORMS_TYPE,)) for source in TRANSFORMS}
     return RecordedInput(
@@ -226,7 +230,9 @@ def upright_frame(bag: BagReader, recorded: RecordedInput) -> str:
     parents: dict[str, str] = {}
     camera = ''
     with suppress(BagError):  # the replay itself reports the damage and the remedy
-        for stored in islice(bag.messages({*names, recorded.camera_info.name}), _SEARCHED):
+        for stored in islice(
+            bag.messages({*names, recorded.camera_info.name}), _MAX_SEARCHED_MESSAGES
+        ):
             if stored.topic in names:
                 for each in stored.message.transforms:
                     child, parent = each.child_frame_id, each.header.frame_id
@@ -255,7 +261,7 @@ def _image_topic(
     kinds = (COMPRESSED_TYPE, IMAGE_TYPE, VIDEO_TYPE)
     if name is not None:
         return bag.find_topic(kinds, name)
-    for usual in _USUAL:
+    for usual in _USUAL_TOPICS:
         topic = _in_namespace(bag, namespace, usual, kinds)
         if topic is not None:
             return topic

@@ -25,7 +25,7 @@ from hmt_ros.nodes.own_messages import OwnMessages
 from hmt_ros.sessions.declared_parameters import values_of
 from hmt_ros.sessions.handled import HANDLED, Handled, handled_of
 from hmt_ros.sessions.parameter_file import yaml_scalar
-from hmt_ros.sessions.session import SUBSCRIBERS, PublishedTopic
+from hmt_ros.sessions.session import SUBSCRIBERS_KEY, PublishedTopic
 from hmt_ros.sessions.transform_buffer import TF_STATIC
 from msg_tools.messages.cdr import canonical, deserialise, serialise
 
@@ -78,7 +78,8 @@ class NodeProcess:
                         [sources, *filter(None, [os.environ.get('PYTHONPATH')])]
                     ),
                     'ROS_LOG_DIR': str(self._player.folder),
-                    # The nodes exit if the replay is killed, see `hmt_ros.nodes.run_node.OWNER`.
+                    # The nodes exit if the replay is killed, see
+                    # `hmt_ros.nodes.run_node.OWNER_VARIABLE`.
                     'HMT_ROS_OWNER': str(os.getpid()),
                 },
                 # The interrupt key must reach only this process, which then stops the node.
@@ -201,7 +202,9 @@ class LiveNode:
 
         transition = Transition(id=Transition.TRANSITION_DEACTIVATE)
         if not self.call(ChangeState, 'change_state', transition=transition).success:
-            raise LiveNodeError(f'the {self.title} can not be deactivated: {self._last_words()}')
+            raise LiveNodeError(
+                f'the {self.title} can not be deactivated: {self._last_output_line()}'
+            )
 
     def call(self, kind: Any, service: str, **fields: Any) -> Any:
         """Calls a service of the node, 'change_state' for example, and returns the answer.
@@ -243,7 +246,7 @@ class LiveNode:
         end = time.monotonic() + START_SECONDS
         while label != 'active':
             if time.monotonic() > end:
-                raise LiveNodeError(f'the {self.title} is {label}: {self._last_words()}')
+                raise LiveNodeError(f'the {self.title} is {label}: {self._last_output_line()}')
             future = self._state.call_async(self._state_request)
             self._wait(future.done, START_SECONDS, 'the state of the node')
             label = future.result().current_state.label
@@ -283,7 +286,7 @@ class LiveNode:
 
         def connected() -> bool:
             values = self._player.diagnostics.get(self.name, {})
-            return all(int(values.get(f'{SUBSCRIBERS}{x}', '0')) >= count for x in topics)
+            return all(int(values.get(f'{SUBSCRIBERS_KEY}{x}', '0')) >= count for x in topics)
 
         self._wait(connected, START_SECONDS, f'subscribers of {", ".join(topics)}')
 
@@ -299,7 +302,9 @@ class LiveNode:
         """
         code = self.stop()
         if code != 0:
-            raise LiveNodeError(f'the {self.title} ended with code {code}: {self._last_words()}')
+            raise LiveNodeError(
+                f'the {self.title} ended with code {code}: {self._last_output_line()}'
+            )
 
     def _options(self, parameters: Any, sensors: tuple[str, ...]) -> list[str]:
         """ROS options with the parameters of the node and the names of its topics."""
@@ -371,15 +376,15 @@ class LiveNode:
             code = self.process.poll()
             if code is not None and not done():
                 raise LiveNodeError(
-                    f'the {self.title} ended with code {code}: {self._last_words()}'
+                    f'the {self.title} ended with code {code}: {self._last_output_line()}'
                 )
             if time.monotonic() > end:
                 raise LiveNodeError(
                     f'the {self.title} is silent: waited {seconds:.0f} s for {what}; '
-                    f'{self._last_words()}'
+                    f'{self._last_output_line()}'
                 )
 
-    def _last_words(self) -> str:
+    def _last_output_line(self) -> str:
         """The last line of the output of the node."""
         lines = [line.strip() for line in self.output().splitlines() if line.strip()]
         return lines[-1] if lines else 'it has written nothing'

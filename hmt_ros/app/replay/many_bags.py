@@ -24,18 +24,18 @@ from tqdm import tqdm
 
 import hmt_ros
 from hmt_ros.app.last_resort import INTERRUPTED
-from hmt_ros.app.progress import Tell, say, show_progress
+from hmt_ros.app.progress import Notify, say, show_progress
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions, parameters_of_bag
 from hmt_ros.inference.threads import limit_threads
 from msg_tools import BagError
 from msg_tools.bags.bag_metadata import FILE_NAME, SUFFIXES
-from msg_tools.files.error_line import LONGEST_LINE, error_line, one_line
+from msg_tools.files.error_line import MAX_LINE, error_line, one_line
 from msg_tools.files.new_folder import locked, new_file
 from msg_tools.files.plain_json import read_plain_json
 
 # Options other than parameters that affect the new bag.
-_DECIDING = (
+_DECISIVE_OPTIONS = (
     'image_topic',
     'camera_info_topic',
     'mask_topic',
@@ -50,9 +50,9 @@ _DECIDING = (
 DONE, BEFORE, FAILED = 'done', 'done before', 'failed'
 
 # Name of the scheduler that uses the cores of this machine.
-LOCAL = 'local'
-_LARGEST_RECORD = 2**24  # maximum size, bytes
-_PATIENCE = 10.0  # maximum time until a scheduler answers, s
+LOCAL_SCHEDULER = 'local'
+_MAX_RECORD_BYTES = 2**24  # maximum size, bytes
+_SCHEDULER_TIMEOUT = 10.0  # maximum time until a scheduler answers, s
 
 
 class Job(NamedTuple):
@@ -83,10 +83,10 @@ class Outcome:
     name: str
     kind: str
     text: str
-    told: tuple[str, ...] = ()
+    notices: tuple[str, ...] = ()
 
 
-def is_many(sources: Sequence[Path], scheduler: str | None) -> bool:
+def has_several_bags(sources: Sequence[Path], scheduler: str | None) -> bool:
     """Whether the command replays several bags."""
     if scheduler is not None or len(sources) > 1:
         return True
@@ -98,13 +98,14 @@ def replay_many(
     sources: Sequence[Path],
     output: Path,
     options: ReplayOptions,
-    tell: Tell,
+    notify: Notify,
     scheduler: str | None = None,
 ) -> int:
     """Replays all bags.
 
     Args:
-        scheduler: address of a Dask scheduler, or `LOCAL`; None replays the bags one by one.
+        scheduler: address of a Dask scheduler, or `LOCAL_SCHEDULER`; None replays the bags one by
+            one.
 
     Returns:
         The exit code: 0 if all bags are done, 1 if some failed, or `INTERRUPTED`.
@@ -125,16 +126,16 @@ def replay_many(
             outcomes = map(replay_job, jobs) if scheduler is None else _by_dask(jobs, scheduler)
             for outcome in outcomes:
                 counts[outcome.kind] += 1
-                for line in outcome.told:
-                    tell(line)
+                for line in outcome.notices:
+                    notify(line)
                 if outcome.kind == FAILED:
-                    tell(f'{outcome.name}: {outcome.text}')
+                    notify(f'{outcome.name}: {outcome.text}')
                 elif not options.quiet:
-                    tqdm.write(one_line(f'{outcome.name}: {outcome.text}', LONGEST_LINE))
+                    tqdm.write(one_line(f'{outcome.name}: {outcome.text}', MAX_LINE))
                 bar.update()
     except KeyboardInterrupt:
         done = counts[DONE] + counts[BEFORE]
-        tell(f'interrupted, {done} of {len(jobs)} bags are done; the same command resumes')
+        notify(f'interrupted, {done} of {len(jobs)} bags are done; the same command resumes')
         return INTERRUPTED
     if not options.quiet:
         say(
@@ -156,7 +157,7 @@ def _by_dask(jobs: Sequence[Job], scheduler: str) -> Iterator[Outcome]:
     with ExitStack() as opened:
         try:
             address = scheduler
-            if scheduler == LOCAL:
+            if scheduler == LOCAL_SCHEDULER:
                 address = opened.enter_context(
                     distributed.LocalCluster(
                         n_workers=max(1, min(len(jobs), len(os.sched_getaffinity(0)))),
@@ -167,7 +168,7 @@ def _by_dask(jobs: Sequence[Job], scheduler: str) -> Iterator[Outcome]:
                         silence_logs=logging.CRITICAL,
                     )
                 )
-            client = opened.enter_context(distributed.Client(address, timeout=_PATIENCE))
+            client = opened.enter_context(distributed.Client(address, timeout=_SCHEDULER_TIMEOUT))
         except (OSError, ValueError, RuntimeError) as error:
             raise ValueError(f'--scheduler {scheduler}: {error_line(error)}') from error
         job_of = {client.submit(_replay_in_worker, job, pure=False): job for job in jobs}
@@ -199,22 +200,22 @@ def _keep_memory() -> None:
 
 def replay_job(job: Job) -> Outcome:
     """Replays one of many bags, unless it is complete."""
-    told: list[str] = []
+    notices: list[str] = []
     try:
-        kind, text = _replayed_once(job, told.append)
+        kind, text = _replayed_once(job, notices.append)
     except Exception as error:  # noqa: BLE001 - the other bags are replayed after any error
-        return _failed(job, error, told)
-    return Outcome(job.name, kind, text, tuple(told))
+        return _failed(job, error, notices)
+    return Outcome(job.name, kind, text, tuple(notices))
 
 
-def _failed(job: Job, error: BaseException, told: Sequence[str]) -> Outcome:
+def _failed(job: Job, error: BaseException, notices: Sequence[str]) -> Outcome:
     text = error_line(error)
     if not isinstance(error, (ValueError, OSError)):
         text = f'{type(error).__name__}: {text}'
-    return Outcome(job.name, FAILED, text, tuple(told))
+    return Outcome(job.name, FAILED, text, tuple(notices))
 
 
-def _replayed_once(job: Job, tell: Tell) -> tuple[str, str]:
+def _replayed_once(job: Job, notify: Notify) -> tuple[str, str]:
     target, options = job.target, job.options
     record = target.with_name(f'{target.name}.replay.json')
     made_from = _made_from(job)
@@ -231,7 +232,7 @@ def _replayed_once(job: Job, tell: Tell) -> tuple[str, str]:
         )
     target.parent.mkdir(parents=True, exist_ok=True)
     _write_record(record, {'done': False, 'made_from': made_from})
-    replayed = replay_bag(job.source, target, options, tell, shows=job.shows)
+    replayed = replay_bag(job.source, target, options, notify, shows=job.shows)
     _write_record(
         record,
         {
@@ -263,7 +264,7 @@ def _made_from(job: Job) -> dict[str, Any]:
             if path.name == FILE_NAME or path.name.endswith(SUFFIXES)
         },
         'parameters': parameters,
-        'options': {name: getattr(options, name) for name in _DECIDING},
+        'options': {name: getattr(options, name) for name in _DECISIVE_OPTIONS},
     }
     # Convert to the types that a record has when it is read again.
     result: dict[str, Any] = json.loads(json.dumps(made_from, default=str))
@@ -286,7 +287,7 @@ def _sizes(folder: Path) -> dict[str, int]:
 def _read_record(path: Path) -> dict[str, Any]:
     """Reads a record; returns an empty one if the file is missing or invalid."""
     with suppress(ValueError):
-        content = read_plain_json(path, _LARGEST_RECORD)
+        content = read_plain_json(path, _MAX_RECORD_BYTES)
         if isinstance(content, dict):
             return content
     return {}

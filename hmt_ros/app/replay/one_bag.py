@@ -11,8 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from hmt_ros.app.progress import Progress, Tell, show_progress
-from hmt_ros.app.replay.inputs import GROUND_TRUTH, RECORDED, RecordedInput, fitted
+from hmt_ros.app.progress import Notify, Progress, show_progress
+from hmt_ros.app.replay.inputs import GROUND_TRUTH, RECORDED_INPUTS, RecordedInput, fitted
 from hmt_ros.app.replay.options import NodeParameters, ReplayOptions, node_parameters
 from hmt_ros.app.replay.tracks import LiveTrack, OfflineTrack, PlayedTrack
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
@@ -33,7 +33,7 @@ from msg_tools.messages.images import ImageError, decode_image, image_message
 Item = TypeVar('Item')
 
 # Maximum number of waiting calls; each keeps a message or an image in memory.
-_MOST_WAITING = 32
+_MAX_WAITING_CALLS = 32
 
 
 @dataclass
@@ -56,7 +56,7 @@ class Replayed:
 
 
 def replay_bag(
-    source: Path, target: Path, options: ReplayOptions, tell: Tell, *, shows: bool | None = None
+    source: Path, target: Path, options: ReplayOptions, notify: Notify, *, shows: bool | None = None
 ) -> Replayed:
     """Replays a bag into a new bag, which is written completely or not at all.
 
@@ -71,16 +71,16 @@ def replay_bag(
     with BagReader(source) as bag:
         recorded = options.recorded(bag)
         recorded.check_stamps(bag)
-        recorded = fitted(bag, recorded, tell)
+        recorded = fitted(bag, recorded, notify)
         parameters = node_parameters(options, recorded)
         # Read the files that the parameters name, so that errors are raised before a node starts.
         subject = prepare_start(parameters.filter).initial
         if subject is None and not options.quiet and not options.people:
             sources = ' or '.join(parameters.filter.sources)
-            tell(f'no --subject: the track starts from {sources}{_subject_hint(source)}')
+            notify(f'no --subject: the track starts from {sources}{_subject_hint(source)}')
         frame = recorded.upright_frame
         if frame and frame == parameters.filter.gravity_frame and not options.quiet:
-            tell(f'gravity and the motion of the camera: from {frame}')
+            notify(f'gravity and the motion of the camera: from {frame}')
         recorded = _used(recorded, parameters)
         with BagWriter(target, overwrite=options.overwrite, namespace=options.namespace) as out:
             topics = {} if options.people else dict(track_messages.TOPICS)
@@ -102,12 +102,13 @@ def replay_bag(
                 ) as bar,
                 _track(options, parameters, out, behind) as track,
             ):
-                result = _play(options, bag, recorded, track, out, behind, bar, tell)
+                result = _play(options, bag, recorded, track, out, behind, bar, notify)
             if not result.tracked:
-                why = f'{source}: {_why_nothing(result, subject, KEYPOINTS in recorded.given)}'
+                reason = _reason_for_no_track(result, subject, KEYPOINTS in recorded.given)
+                why = f'{source}: {reason}'
                 if subject is not None or result.last_fault or not result.images:
                     raise ValueError(why)
-                tell(why)
+                notify(why)
     return result
 
 
@@ -157,12 +158,12 @@ def _play(
     out: BagWriter,
     behind: WriteBehind,
     bar: Progress,
-    tell: Tell,
+    notify: Notify,
 ) -> Replayed:
     """Passes the messages of the bag to the nodes, and copies some into the new bag."""
     result = Replayed()
     # Small inputs are copied, so that the new bag can be replayed with the same inputs.
-    small = {source for row in RECORDED if row.pixels is None for source in row.types}
+    small = {source for row in RECORDED_INPUTS if row.pixels is None for source in row.types}
     copied = {GROUND_TRUTH, *small, *TRANSFORMS}
     if options.with_images:
         copied |= {IMAGE, CAMERA_INFO}
@@ -180,11 +181,11 @@ def _play(
                     f'{bag.path}: {handled.faults[0]} (--keep-going skips such messages)'
                 )
         for text in handled.warnings:
-            tell(f'{bag.path}: {text}')
+            notify(f'{bag.path}: {text}')
 
     messages = recorded.messages(bag)
     with ReadAhead(partial(_read, messages, not options.live), messages.close) as ahead:
-        for source, stored, given in _readable(ahead, options.keep_going, tell):
+        for source, stored, given in _readable(ahead, options.keep_going, notify):
             if source in copied:
                 # Inputs keep their names; the namespace applies only to results.
                 topic = absolute_name(stored.topic)
@@ -224,7 +225,7 @@ def _read(messages: Iterator[tuple[str, BagMessage]], decode: bool) -> tuple[str
 
 
 def _readable(
-    messages: Iterator[tuple[str, BagMessage, Any]], keep_going: bool, tell: Tell
+    messages: Iterator[tuple[str, BagMessage, Any]], keep_going: bool, notify: Notify
 ) -> Iterator[tuple[str, BagMessage, Any]]:
     """Yields the messages that can be read.
 
@@ -239,12 +240,12 @@ def _readable(
         except BagError as error:
             if not keep_going:
                 raise
-            tell(str(error))
+            notify(str(error))
             continue
         yield found
 
 
-def _why_nothing(result: Replayed, subject: object, detected: bool) -> str:
+def _reason_for_no_track(result: Replayed, subject: object, detected: bool) -> str:
     if isinstance(subject, Subject) and result.images and subject.stamp_ns > result.last_stamp:
         return (
             f'the joints of the subject file were seen at {subject.stamp_ns} ns, after the last '
@@ -310,7 +311,9 @@ class WriteBehind(AbstractContextManager['WriteBehind']):
 
     def call(self, function: Callable[..., None], *arguments: Any) -> None:
         """Queues a call, which runs after all earlier calls."""
-        while self._waiting and (len(self._waiting) >= _MOST_WAITING or self._waiting[0].done()):
+        while self._waiting and (
+            len(self._waiting) >= _MAX_WAITING_CALLS or self._waiting[0].done()
+        ):
             self._waiting.popleft().result()
         self._waiting.append(self._thread.submit(self._make, function, arguments))
 

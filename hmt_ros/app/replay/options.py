@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hmt_ros.app.replay.inputs import RECORDED, RecordedInput, recorded_input, upright_frame
+from hmt_ros.app.replay.inputs import RECORDED_INPUTS, RecordedInput, recorded_input, upright_frame
 from hmt_ros.sessions.bme_parameters import BmeParameters
-from hmt_ros.sessions.declared_parameters import OWN_KEYPOINTS, with_values
+from hmt_ros.sessions.declared_parameters import OWN_SOURCE, with_values
 from hmt_ros.sessions.image_inputs import (
     DEPTH,
     DETECTIONS,
@@ -33,11 +33,11 @@ STAMPS, LOG_TIMES = 'stamps', 'log'
 # Prefix of parameters in --set, by node.
 _PREFIXES = {SMOOTHER: 'smoother.', BME: 'bme.', FILTER: ''}
 # Parameters that replay sets itself; their values in a parameter file are ignored.
-_DECIDED_HERE = ('image_transport', 'autostart')
+_OWN_PARAMETERS = ('image_transport', 'autostart')
 # Prefixes of parameters that ROS declares for every node.
-_OF_ROS = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
+_ROS_PREFIXES = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
 # Placeholder for the folder of the bag, in options that name a file.
-_BAG = '{bag}'
+_BAG_PLACEHOLDER = '{bag}'
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class ReplayOptions:
     def of_bag(self, source: Path) -> ReplayOptions:
         """The options for one bag, with its folder in place of `{bag}` in file names."""
         folder = str(source if source.is_dir() else source.parent)
-        return self._renamed(lambda name: name.replace(_BAG, folder))
+        return self._renamed(lambda name: name.replace(_BAG_PLACEHOLDER, folder))
 
     def with_absolute_paths(self) -> ReplayOptions:
         """The options with absolute file names, which are valid in any working directory."""
@@ -168,7 +168,7 @@ def _filter_parameters(options: ReplayOptions, recorded: RecordedInput) -> Filte
     if options.subject is not None:
         values['subject_file'] = str(options.subject)
     has_keypoints = recorded.of(KEYPOINTS) is not None
-    if (source := values.get('source', OWN_KEYPOINTS)) != OWN_KEYPOINTS:
+    if (source := values.get('source', OWN_SOURCE)) != OWN_SOURCE:
         detections = recorded.of(DETECTIONS)
         has_keypoints = detections is not None and detections.msgtype == SOURCES.get(source)
     values.setdefault('use_keypoints', has_keypoints)
@@ -189,7 +189,7 @@ def _tracking_values(options: ReplayOptions, recorded: RecordedInput, node: str)
         'background_file': options.background and str(options.background),
     }
     values |= {name: value for name, value in given.items() if value is not None}
-    for row in RECORDED:
+    for row in RECORDED_INPUTS:
         if row.name in (MASK, DEPTH):
             values.setdefault(row.parameter, recorded.of(row.name) is not None)
     if 'gravity' not in values:
@@ -257,14 +257,14 @@ def _given_values(options: ReplayOptions, node: str) -> dict[str, Any]:
         values.update(
             (name, value)
             for name, value in read.items()
-            if not name.startswith(_OF_ROS) and name not in _DECIDED_HERE
+            if not name.startswith(_ROS_PREFIXES) and name not in _OWN_PARAMETERS
         )
     for text in options.settings:
         name, equals, value = text.partition('=')
         owner = next(owner for owner, prefix in _PREFIXES.items() if name.startswith(prefix))
         name = name.removeprefix(_PREFIXES[owner])
         owner = PEOPLE_NODE if owner == FILTER and options.people else owner
-        if not equals or name in _DECIDED_HERE:
+        if not equals or name in _OWN_PARAMETERS:
             why = f'{name} is set by replay itself' if equals else 'wanted NAME=VALUE'
             raise ValueError(f'--set {text}: {why}')
         if owner != node:

@@ -74,7 +74,7 @@ class PlayedTrack(AbstractContextManager['PlayedTrack'], ABC):
         result = None
         if source in self._seen:
             result = self._predicted(self._handled(self._bme, source, message))
-        return self._handed_on(_together(result, self._handled(self._filter, source, message)))
+        return self._forwarded(_together(result, self._handled(self._filter, source, message)))
 
     def finish(self) -> Handled:
         """Finishes all nodes and returns when their remaining results are written."""
@@ -82,7 +82,7 @@ class PlayedTrack(AbstractContextManager['PlayedTrack'], ABC):
         if self._bme is not None:
             result = self._predicted(self._finished(self._bme))
             self._heard = ()
-        result = self._handed_on(_together(result, self._finished(self._filter)))
+        result = self._forwarded(_together(result, self._finished(self._filter)))
         if self._smoother is not None:
             result = _together(result, self._finished(self._smoother))
         return result
@@ -93,14 +93,14 @@ class PlayedTrack(AbstractContextManager['PlayedTrack'], ABC):
             result = _together(result, self._handled(self._filter, topic))
         return result
 
-    def _handed_on(self, result: Handled) -> Handled:
+    def _forwarded(self, result: Handled) -> Handled:
         """Passes the messages of the filter to smoother and BME."""
         for topic, _ in result.published:
             if topic in self._smoothed:
                 result = _together(result, self._handled(self._smoother, topic))
             if topic in self._heard:
                 predicted = self._predicted(self._handled(self._bme, topic))
-                result = _together(result, self._handed_on(predicted))
+                result = _together(result, self._forwarded(predicted))
         return result
 
 

@@ -16,7 +16,7 @@ from msg_tools import BagReader
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.keypoints import KEYPOINTS_3D, Positions, positions_of
 
-_MIDDLES = {ORIGIN: HIPS, 'neck': ('left_shoulder', 'right_shoulder')}
+_MIDDLE_JOINTS = {ORIGIN: HIPS, 'neck': ('left_shoulder', 'right_shoulder')}
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ def _with_middles(joints: dict[str, Array]) -> dict[str, Array]:
     """Sets pelvis and neck to the middle of the hips and of the shoulders, if these are known."""
     middles = {
         name: np.mean([joints[end] for end in ends], axis=0)
-        for name, ends in _MIDDLES.items()
+        for name, ends in _MIDDLE_JOINTS.items()
         if set(ends) <= joints.keys()
     }
     return {**joints, **middles}

@@ -21,7 +21,7 @@ from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import decode_image, encode_jpeg
 
 # Width in px and JPEG quality, from the best to the smallest.
-_LEVELS = (
+_QUALITIES = (
     (640, 80),
     (640, 65),
     (480, 65),
@@ -160,13 +160,13 @@ def film_strip(
 def _small(image: Image, allowed: int, level: int) -> tuple[bytes, int]:
     """The best JPEG of an image within `allowed` bytes, or else the smallest, and its level."""
     while True:
-        width, quality = _LEVELS[level]
+        width, quality = _QUALITIES[level]
         scaled = image
         if image.shape[1] > width:
             height = max(round(image.shape[0] * width / image.shape[1]), 1)
             resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
             scaled = np.asarray(resized, dtype=np.uint8)
         jpeg = encode_jpeg(scaled, quality)
-        if len(jpeg) <= allowed or level == len(_LEVELS) - 1:
+        if len(jpeg) <= allowed or level == len(_QUALITIES) - 1:
             return jpeg, level
         level += 1

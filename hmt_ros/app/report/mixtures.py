@@ -27,16 +27,16 @@ from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
 # Probabilities of the lower end, the median and the upper end of a 90 % interval.
 PROBABILITIES = np.array([0.05, 0.5, 0.95])
 # Horizontal plane through a level camera, used if the floor is unknown.
-_LEVEL = np.array([0.0, -1.0, 0.0, 0.0])
-_HALVINGS = 22
+_LEVEL_PLANE = np.array([0.0, -1.0, 0.0, 0.0])
+_BISECTION_STEPS = 22
 # Radius of the 90 % region of a 3D normal distribution, in standard deviations.
 _RADIUS = 2.500278
 
 # Joints whose paths are drawn for trajectories, and maximum number of drawn trajectories.
-ENDS = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')
-KEPT_TRAJECTORIES = 8
+PATH_JOINTS = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')
+MAX_TRAJECTORIES = 8
 # Kinds of mixtures that are shown with regions, and with heights and angles over time.
-BANDED = ('posterior', 'smoothed')
+KINDS_WITH_BANDS = ('posterior', 'smoothed')
 _TRAJECTORIES = 'trajectories'
 _ORDER = (
     'posterior',
@@ -64,7 +64,7 @@ def ground_at(grounds: Mapping[int, GroundState], stamp_ns: int) -> GroundState 
 def _plane_of(ground: GroundState | None) -> Array:
     """The floor (4,), or else the plane of a level camera."""
     plane = None if ground is None else ground.plane
-    return _LEVEL if plane is None else plane
+    return _LEVEL_PLANE if plane is None else plane
 
 
 def heights_of(joints: Array, ground: GroundState | None) -> Array:
@@ -122,7 +122,7 @@ def intervals(weights: Array, marginals: Array) -> Array:
     means, sigmas = np.asarray(marginals, dtype=np.float64)[..., None]
     low = np.broadcast_to((means - 6.0 * sigmas).min(axis=0), (*means.shape[1:2], 3)).copy()
     high = np.broadcast_to((means + 6.0 * sigmas).max(axis=0), low.shape).copy()
-    for _ in range(_HALVINGS):
+    for _ in range(_BISECTION_STEPS):
         middle = 0.5 * (low + high)
         below = np.einsum('k,kvp->vp', weights, ndtr((middle - means) / sigmas)) < PROBABILITIES
         low, high = np.where(below, middle, low), np.where(below, high, middle)
@@ -163,15 +163,15 @@ class Window:
         stamps_ns: (T,) times of the poses.
         weights: (M,) weights of all trajectories, heaviest first.
         free_energy: (I,) free energy per iteration, nats; empty if not recorded.
-        ways: (at most `KEPT_TRAJECTORIES`, T, J, 3) paths of the joints in `ENDS` that the body
-            has, m, heaviest trajectory first; None if the body is unknown.
+        joint_paths: (at most `MAX_TRAJECTORIES`, T, J, 3) paths of the joints in `PATH_JOINTS` that
+            the body has, m, heaviest trajectory first; None if the body is unknown.
     """
 
     stamp_ns: int
     stamps_ns: tuple[int, ...]
     weights: Array
     free_energy: Array
-    ways: Array | None
+    joint_paths: Array | None
 
 
 Mixture = TypeVar('Mixture', Moment, Window)
@@ -343,7 +343,7 @@ def _pose_layer(
     stamp, kind = content.stamp_ns, content.kind.name.lower()
     body, marginals = None, np.empty((2, len(order), 0))
     regions = np.empty((len(order), 0, 6))
-    if kind in BANDED:
+    if kind in KINDS_WITH_BANDS:
         body = bodies.of(topic, content)
         marginals = marginals_of(content, body, ground_at(grounds, stamp))
         regions = regions_of(content)
@@ -365,14 +365,16 @@ def _trajectory_layer(topic: str, bodies: RecordedBodies, message: Any) -> Layer
     """A layer with the window of one message."""
     content = trajectory_mixture_of(message)
     body = bodies.of(topic, content)
-    ends = () if body is None else tuple(x for x in ENDS if x in body.joint_names)
+    ends = () if body is None else tuple(x for x in PATH_JOINTS if x in body.joint_names)
     order = np.argsort(-content.weights, kind='stable')
-    ways = None
+    joint_paths = None
     if body is not None:
-        means = content.means[order[:KEPT_TRAJECTORIES]]
+        means = content.means[order[:MAX_TRAJECTORIES]]
         joints = body.joint_positions(means.reshape(-1, body.dimension))
-        ways = joints[:, body.skeleton.joint_index(ends)]
-        ways = ways.reshape(*means.shape[:2], len(ends), 3)
+        joint_paths = joints[:, body.skeleton.joint_index(ends)]
+        joint_paths = joint_paths.reshape(*means.shape[:2], len(ends), 3)
     stamp = content.stamps_ns[-1]
-    window = Window(stamp, content.stamps_ns, content.weights[order], content.free_energy, ways)
+    window = Window(
+        stamp, content.stamps_ns, content.weights[order], content.free_energy, joint_paths
+    )
     return Layer(topic, _TRAJECTORIES, content.frame_id, ends, {stamp: window})

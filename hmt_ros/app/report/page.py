@@ -30,19 +30,19 @@ from hmt_ros.app.report.mixtures import (
     intervals,
 )
 from hmt_ros.app.report.pictures import PROBABILITIES
-from hmt_ros.app.report.skeletons import LEFT, RIGHT, bones_of
-from hmt_ros.evaluation.pose_scores import LOST, ORIGIN, origin_joints
+from hmt_ros.app.report.skeletons import LEFT_COLOUR, RIGHT_COLOUR, bones_of
+from hmt_ros.evaluation.pose_scores import LOST_ERROR, ORIGIN, origin_joints
 from hmt_ros.evaluation.track_scores import TrackScores, Truth, mode_errors
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.calibration import coverage
 from msg_tools.messages.ground import GroundState
 
 # Quantisation steps: minimum for positions, and step for regions, m; for pixels, in image widths.
-FINEST, _REGION = 5e-4, 1e-4
-_PIXEL = 1 / 8000
-_NOWHERE = -(2**15)  # code of NaN and of invisible pixels
-_LARGEST = 2**15 - 1
-_SIDES = {LEFT: 'left', RIGHT: 'right'}
+MIN_POSITION_STEP, _REGION_STEP = 5e-4, 1e-4
+_PIXEL_STEP = 1 / 8000
+_NAN_CODE = -(2**15)  # code of NaN and of invisible pixels
+_MAX_CODE = 2**15 - 1
+_SIDES = {LEFT_COLOUR: 'left', RIGHT_COLOUR: 'right'}
 _SCRIPTS = ('data.js', 'view.js', 'charts.js', 'report.js')
 
 
@@ -88,7 +88,7 @@ def data_size(mixtures: RecordedMixtures) -> int:
             size += 8 * moment.regions.size // 3
     for topic in mixtures.trajectories:
         for window in topic.mixtures.values():
-            ways = 0 if window.ways is None else window.ways[..., 0].size
+            ways = 0 if window.joint_paths is None else window.joint_paths[..., 0].size
             size += 8 * ways + 10 * len(window.weights) + 20 * len(window.free_energy)
             size += 24 * len(window.stamps_ns)
     return size
@@ -155,9 +155,9 @@ def page_data(content: Content) -> dict[str, Any]:
         'times': [_rounded((stamp - start) * 1e-9, 6) for stamp in stamps],
         'origin': [_rounded(x, 6) for x in grid.origin],
         'step': grid.step,
-        'pixel': _PIXEL,
-        'region': _REGION,
-        'lost_mm': 1e3 * LOST,
+        'pixel': _PIXEL_STEP,
+        'region': _REGION_STEP,
+        'lost_mm': 1e3 * LOST_ERROR,
         'layers': [_layer(layer, content, grid) for layer in content.mixtures.layers],
         'trajectories': [
             _trajectories(topic, start, grid) for topic in content.mixtures.trajectories
@@ -184,10 +184,10 @@ class _Grid:
         mixtures, truth = content.mixtures, content.truth
         parts = [moment.joints for layer in mixtures.layers for moment in layer.mixtures.values()]
         parts += [
-            window.ways
+            window.joint_paths
             for topic in mixtures.trajectories
             for window in topic.mixtures.values()
-            if window.ways is not None
+            if window.joint_paths is not None
         ]
         if truth is not None:
             parts += [truth.joints[t] for t in content.stamps if t in truth.joints]
@@ -195,7 +195,7 @@ class _Grid:
             parts += content.detector.joints.values()
         points = np.concatenate([part.reshape(-1, 3) for part in parts or [np.zeros((1, 3))]])
         low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-        step = max(FINEST, float((high - low).max()) / (2 * _LARGEST))
+        step = max(MIN_POSITION_STEP, float((high - low).max()) / (2 * _MAX_CODE))
         return _Grid(np.round(0.5 * (low + high), 6), step)
 
     def encoded(self, positions: Array) -> str:
@@ -235,7 +235,7 @@ def _layer(layer: Layer[Moment], content: Content, grid: _Grid) -> dict[str, Any
 def _regions(moments: Sequence[Moment]) -> str | None:
     """Regions of the joints of all modes; None if some are unknown."""
     known = moments and all(moment.regions.size for moment in moments)
-    every = [moment.regions.ravel() / _REGION for moment in moments]
+    every = [moment.regions.ravel() / _REGION_STEP for moment in moments]
     return _base64(_whole(np.concatenate(every))) if known else None
 
 
@@ -288,8 +288,8 @@ def _bands(layer: Layer[Moment], stamps: Sequence[int]) -> dict[str, Any] | None
 
 
 def _whole(values: Array) -> Array:
-    """Rounds values and clips them to 16-bit integers; NaN becomes `_NOWHERE`."""
-    return np.where(np.isnan(values), _NOWHERE, np.clip(np.rint(values), -_LARGEST, _LARGEST))
+    """Rounds values and clips them to 16-bit integers; NaN becomes `_NAN_CODE`."""
+    return np.where(np.isnan(values), _NAN_CODE, np.clip(np.rint(values), -_MAX_CODE, _MAX_CODE))
 
 
 def _probability(value: float) -> float | None:
@@ -311,9 +311,9 @@ def _pixels(images: FilmStrip, positions: Array) -> str | None:
     if images.camera is None:
         return None
     with np.errstate(invalid='ignore'):
-        pixels = np.rint(images.camera.project(positions) / (images.size[0] * _PIXEL))
-    hidden = ~(np.abs(pixels) <= _LARGEST).all(-1)
-    pixels[hidden] = _NOWHERE
+        pixels = np.rint(images.camera.project(positions) / (images.size[0] * _PIXEL_STEP))
+    hidden = ~(np.abs(pixels) <= _MAX_CODE).all(-1)
+    pixels[hidden] = _NAN_CODE
     return _base64(pixels)
 
 
@@ -323,7 +323,7 @@ def _trajectories(layer: Layer[Window], start: int, grid: _Grid) -> dict[str, An
             'times': [_rounded((stamp - start) * 1e-9, 6) for stamp in window.stamps_ns],
             'weights': [_rounded(x, 5) for x in window.weights],
             'free_energy': [_rounded(x, 4) for x in window.free_energy if np.isfinite(x)],
-            'ways': None if window.ways is None else grid.encoded(window.ways),
+            'ways': None if window.joint_paths is None else grid.encoded(window.joint_paths),
         }
 
     return {

@@ -17,13 +17,13 @@ from hmt_ros.app.report.skeletons import (
     draw_side_views,
     new_picture,
 )
-from hmt_ros.evaluation.pose_scores import LOST
+from hmt_ros.evaluation.pose_scores import LOST_ERROR
 from hmt_ros.evaluation.track_scores import TrackScores, Truth, mode_errors
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.calibration import coverage
 
 # Number of times in the overview and on the sheets.
-IN_OVERVIEW, ON_SHEETS = 4, 8
+OVERVIEW_TIMES, SHEET_TIMES = 4, 8
 PICTURES = {
     'overview.png': 'images with the heaviest modes, and the same person from the side',
     'overlays.png': 'the heaviest modes on more images',
@@ -38,7 +38,7 @@ _COLOURS = ('#0072b2', '#d55e00', '#009e73', '#cc79a7', '#e69f00', '#56b4e9', '#
 
 def shown_in_pictures(track: Layer[Moment]) -> set[int]:
     """Stamps of the images that `draw_pictures` needs."""
-    return {*track.spread(IN_OVERVIEW), *track.spread(ON_SHEETS)} if track.mixtures else set()
+    return {*track.spread(OVERVIEW_TIMES), *track.spread(SHEET_TIMES)} if track.mixtures else set()
 
 
 def draw_pictures(
@@ -62,7 +62,7 @@ def draw_pictures(
     """
     if mixtures.layers:
         track = mixtures.layers[0]
-        few, many = track.spread(IN_OVERVIEW), track.spread(ON_SHEETS)
+        few, many = track.spread(OVERVIEW_TIMES), track.spread(SHEET_TIMES)
         chosen = [{t: images.kept[t] for t in own if t in images.kept} for own in (few, many)]
         if images.camera is not None and chosen[0]:
             draw_overview(folder / 'overview.png', track, images.camera, chosen[0], truth)
@@ -119,8 +119,8 @@ def _draw_errors(axes: Any, track: Layer[Moment], truth: Truth, seconds: Array) 
     )
     for curve, (label, colour, style) in zip(curves, styles, strict=True):
         axes.plot(seconds, curve, color=colour, linestyle=style, label=label, linewidth=1.6)
-    axes.axhline(1e3 * LOST, color='#bbbbbb', linewidth=0.8, zorder=0)
-    axes.annotate('lost', (seconds[-1], 1e3 * LOST), ha='right', va='bottom', color='#888888')
+    axes.axhline(1e3 * LOST_ERROR, color='#bbbbbb', linewidth=0.8, zorder=0)
+    axes.annotate('lost', (seconds[-1], 1e3 * LOST_ERROR), ha='right', va='bottom', color='#888888')
     axes.set(ylabel='mean joint error, mm', ylim=(0, None))
     axes.legend(frameon=False, ncols=3, loc='upper left', bbox_to_anchor=(0, 1.12))
 

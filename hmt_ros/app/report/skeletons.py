@@ -30,13 +30,13 @@ from hmt_ros.inference.arrays import Array, Image
 Track = Layer[Moment]
 
 # Colours from the palette of Okabe and Ito.
-LEFT, RIGHT, TRUNK, TRUTH = '#e69f00', '#0072b2', '#666666', '#000000'
+LEFT_COLOUR, RIGHT_COLOUR, TRUNK_COLOUR, TRUTH_COLOUR = '#e69f00', '#0072b2', '#666666', '#000000'
 LIMBS = ('hip', 'knee', 'ankle', 'toe'), ('shoulder', 'elbow', 'wrist', 'hand')
 BONES = (
-    *(('pelvis', 'neck', TRUNK), ('neck', 'head', TRUNK)),
+    *(('pelvis', 'neck', TRUNK_COLOUR), ('neck', 'head', TRUNK_COLOUR)),
     *(
         bone
-        for side, colour in (('left', LEFT), ('right', RIGHT))
+        for side, colour in (('left', LEFT_COLOUR), ('right', RIGHT_COLOUR))
         for start, limb in (('pelvis', LIMBS[0]), ('neck', LIMBS[1]))
         for bone in (
             (start, f'{side}_{limb[0]}', colour),
@@ -45,7 +45,7 @@ BONES = (
     ),
 )
 # Trunk bones of a skeleton without a pelvis.
-_TRUNK_OF_HIPS = ((*HIPS, TRUNK), *(('neck', hip, TRUNK) for hip in HIPS))
+_HIP_TRUNK_BONES = ((*HIPS, TRUNK_COLOUR), *(('neck', hip, TRUNK_COLOUR) for hip in HIPS))
 STYLE: Any = {
     'font.size': 9.0,
     'axes.spines.top': False,
@@ -54,14 +54,14 @@ STYLE: Any = {
     'savefig.facecolor': 'white',
 }
 # Maximum number of modes on an image, because more would hide it.
-ON_IMAGE = 3
-FAINTEST = 0.12
-_DASHED: Any = (0, (2, 1.2))
+MAX_MODES_ON_IMAGE = 3
+MIN_OPACITY = 0.12
+_DASH_PATTERN: Any = (0, (2, 1.2))
 
 
 def bones_of(names: Sequence[str]) -> list[tuple[int, int, str]]:
     """Joint indices and colour of each bone whose two joints are among the names."""
-    bones = BONES if ORIGIN in names else (*BONES, *_TRUNK_OF_HIPS)
+    bones = BONES if ORIGIN in names else (*BONES, *_HIP_TRUNK_BONES)
     return [(names.index(a), names.index(b), c) for a, b, c in bones if {a, b} <= set(names)]
 
 
@@ -122,7 +122,7 @@ def draw_overlays(path: Path, track: Track, camera: Camera, images: dict[int, Im
         _draw_on_image(axes, track, moment, camera, images[moment.stamp_ns], box)
 
     ratio = (box[3] - box[1]) / (box[2] - box[0])
-    title = f'the {ON_IMAGE} heaviest modes'
+    title = f'the {MAX_MODES_ON_IMAGE} heaviest modes'
     _draw_sheet(path, track, moments, ratio, draw, title, truth=False)
 
 
@@ -198,14 +198,14 @@ def _draw_on_image(
     axes: Any, track: Track, moment: Moment, camera: Camera, image: Image, box: Sequence[float]
 ) -> None:
     axes.imshow(image[..., ::-1], interpolation='lanczos')
-    for rank in reversed(range(min(ON_IMAGE, len(moment.weights)))):
+    for rank in reversed(range(min(MAX_MODES_ON_IMAGE, len(moment.weights)))):
         share = moment.weights[rank] / moment.weights[0]
         _add_skeleton(
             axes,
             track.joint_names,
             camera.project(moment.joints[rank]),
             2.4 if rank == 0 else 1.4,
-            1.0 if rank == 0 else FAINTEST + 0.6 * share,
+            1.0 if rank == 0 else MIN_OPACITY + 0.6 * share,
             halo=rank == 0,
         )
     left, top, right, bottom = box
@@ -240,12 +240,12 @@ class _SideView:
         seen = self._seen(moment.joints, self._names)
         for rank in reversed(range(len(seen))):
             share = moment.weights[rank] / moment.weights[0]
-            strength = FAINTEST + (1 - FAINTEST) * share
+            strength = MIN_OPACITY + (1 - MIN_OPACITY) * share
             _add_skeleton(axes, self._names, seen[rank], 2.2 if rank == 0 else 1.5, strength)
         if self._truth is not None and moment.stamp_ns in self._truth.joints:
             names = self._truth.joint_names
             points = self._seen(self._truth.joints[moment.stamp_ns], names)
-            _add_skeleton(axes, names, points, 1.3, 1.0, colour=TRUTH, style=_DASHED)
+            _add_skeleton(axes, names, points, 1.3, 1.0, colour=TRUTH_COLOUR, style=_DASH_PATTERN)
         (left, bottom), (right, top) = self._low, self._high
         axes.set(xlim=(left, right), ylim=(bottom, top), aspect='equal')
         axes.tick_params(length=2, labelsize=7, color='#888888')
@@ -283,12 +283,18 @@ def _add_skeleton(
 
 def _add_legend(figure: Figure, truth: bool) -> None:
     entries = [
-        Line2D([], [], color=LEFT, linewidth=2.4, label='left limbs'),
-        Line2D([], [], color=RIGHT, linewidth=2.4, label='right limbs'),
-        Line2D([], [], color=RIGHT, linewidth=1.5, alpha=0.35, label='fainter: less probable'),
+        Line2D([], [], color=LEFT_COLOUR, linewidth=2.4, label='left limbs'),
+        Line2D([], [], color=RIGHT_COLOUR, linewidth=2.4, label='right limbs'),
+        Line2D(
+            [], [], color=RIGHT_COLOUR, linewidth=1.5, alpha=0.35, label='fainter: less probable'
+        ),
     ]
     if truth:
-        entries.append(Line2D([], [], color=TRUTH, linewidth=1.3, linestyle=_DASHED, label='truth'))
+        entries.append(
+            Line2D(
+                [], [], color=TRUTH_COLOUR, linewidth=1.3, linestyle=_DASH_PATTERN, label='truth'
+            )
+        )
     figure.legend(handles=entries, loc='lower center', ncols=len(entries), frameon=False)
 
 
@@ -305,7 +311,9 @@ def _with_images(track: Track, images: dict[int, Image]) -> list[Moment]:
 
 def _crop(moments: list[Moment], camera: Camera) -> tuple[float, ...]:
     """Left, top, right and bottom of the image region with the heaviest modes, px."""
-    pixels = np.concatenate([camera.project(m.joints[:ON_IMAGE]).reshape(-1, 2) for m in moments])
+    pixels = np.concatenate(
+        [camera.project(m.joints[:MAX_MODES_ON_IMAGE]).reshape(-1, 2) for m in moments]
+    )
     pixels = pixels[np.isfinite(pixels).all(1)]
     low, high = pixels.min(0), pixels.max(0)
     margin = 0.12 * (high - low).max()

@@ -27,23 +27,27 @@ from hmt_ros.inference.linear_algebra import product
 
 Bytes = NDArray[np.uint8]
 
-SMALLEST = 60  # minimum area of a person, px
+MIN_AREA = 60  # minimum area of a person, px
 # Maximum ratio of the sides of a person's bounding box, and maximum share of the box that a person
 # fills.
-LONGEST = 5.0
-FULLEST = 0.93
+MAX_SIDE_RATIO = 5.0
+MAX_FILLED_FRACTION = 0.93
 # Maximum area of a piece relative to the main blob; maximum gap relative to its longer side.
-PIECE = 0.35
-GAP = 0.12
-NOTABLE = 0.02  # share of the person's area above which a left-out blob is reported
-SMALLEST_HOLE = 0.004  # share of the area below which a hole is noise
-SMOOTHING = 5  # number of averaged points of an outline, to remove the steps of the pixel grid
+MAX_PIECE_AREA = 0.35
+MAX_GAP = 0.12
+NOTABLE_AREA = 0.02  # share of the person's area above which a left-out blob is reported
+MIN_HOLE_AREA = 0.004  # share of the area below which a hole is noise
+SMOOTHED_POINTS = (
+    5  # number of averaged points of an outline, to remove the steps of the pixel grid
+)
 SIDES = ('left', 'top', 'right', 'bottom')
 
-SIDE = 192  # side length of the view, px
-FILLED = 0.8  # approximate ratio of the longer side of the person to the side of the view
-UPRIGHT = np.eye(3)
-STRAIGHT = np.radians(2.0)  # angle to the optical axis below which the view is not rotated
+VIEW_SIDE = 192  # side length of the view, px
+FILLED_FRACTION = 0.8  # approximate ratio of the longer side of the person to the side of the view
+UPRIGHT_FRAME = np.eye(3)
+MAX_STRAIGHT_ANGLE = np.radians(
+    2.0
+)  # angle to the optical axis below which the view is not rotated
 
 
 class NoSilhouetteError(ValueError):
@@ -110,9 +114,9 @@ def person_blob(mask: ArrayLike) -> PersonBlob:
     part = seen[y : y + h, x : x + w]
     count, labels, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=8)
     area = stats[1:, cv2.CC_STAT_AREA]
-    if area.max() < SMALLEST:
+    if area.max() < MIN_AREA:
         raise NoSilhouetteError(
-            f'the largest blob of the silhouette has {area.max()} px, wanted {SMALLEST} at least'
+            f'the largest blob of the silhouette has {area.max()} px, wanted {MIN_AREA} at least'
         )
     left_out = 0
     if count > 2:
@@ -128,17 +132,17 @@ def _belonging(stats: NDArray[np.int32]) -> tuple[Mask, int]:
     """Mask (n,) of the blobs that belong to the person, and the number of other large blobs."""
     area = stats[:, cv2.CC_STAT_AREA].astype(float)
     width, height = (stats[:, i].astype(float) for i in (cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT))
-    like = np.maximum(width / height, height / width) <= LONGEST
-    like &= area < FULLEST * width * height
-    like &= area >= SMALLEST
+    like = np.maximum(width / height, height / width) <= MAX_SIDE_RATIO
+    like &= area < MAX_FILLED_FRACTION * width * height
+    like &= area >= MIN_AREA
     main = int(np.argmax(np.where(like, area, -1.0) if like.any() else area))
     left, top = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_TOP]
     apart_x = np.maximum(left - (left + width)[main], left[main] - (left + width))
     apart_y = np.maximum(top - (top + height)[main], top[main] - (top + height))
-    near = np.maximum(apart_x, apart_y) < GAP * max(height[main], width[main])
-    kept = near & (area < PIECE * area[main])
+    near = np.maximum(apart_x, apart_y) < MAX_GAP * max(height[main], width[main])
+    kept = near & (area < MAX_PIECE_AREA * area[main])
     kept[main] = True
-    return kept, int(np.count_nonzero(~kept & (area >= NOTABLE * area[main])))
+    return kept, int(np.count_nonzero(~kept & (area >= NOTABLE_AREA * area[main])))
 
 
 def sample_contour(mask: Bytes, count: int = 100) -> tuple[Array, Array]:
@@ -163,7 +167,7 @@ def sample_contour(mask: Bytes, count: int = 100) -> tuple[Array, Array]:
     for outline, (_, _, _, parent) in zip(found, tree[0] if tree is not None else ()):
         if len(outline) < 12:
             continue
-        if parent >= 0 and cv2.contourArea(outline) < SMALLEST_HOLE * area:
+        if parent >= 0 and cv2.contourArea(outline) < MIN_HOLE_AREA * area:
             continue
         outlines.append(_smooth(outline[:, 0].astype(np.float64) - 1.0))
     if not outlines:
@@ -182,7 +186,7 @@ def sample_contour(mask: Bytes, count: int = 100) -> tuple[Array, Array]:
         closed = np.concatenate([outline, outline[:1]])
         here = at[mine] - (end - length)
         points[mine] = np.stack([np.interp(here, along, closed[:, i]) for i in (0, 1)], axis=1)
-        chord = 0.5 * length / len(outline) * SMOOTHING
+        chord = 0.5 * length / len(outline) * SMOOTHED_POINTS
         ahead, behind = (
             np.stack([np.interp(s % length, along, closed[:, i]) for i in (0, 1)], axis=1)
             for s in (here + chord, here - chord)
@@ -193,14 +197,14 @@ def sample_contour(mask: Bytes, count: int = 100) -> tuple[Array, Array]:
 
 def _smooth(outline: Array) -> Array:
     total = outline.copy()
-    for k in range(1, SMOOTHING // 2 + 1):
+    for k in range(1, SMOOTHED_POINTS // 2 + 1):
         total += np.roll(outline, k, axis=0)
         total += np.roll(outline, -k, axis=0)
-    return total / (2 * (SMOOTHING // 2) + 1)
+    return total / (2 * (SMOOTHED_POINTS // 2) + 1)
 
 
 def centred_view(
-    blob: PersonBlob, camera: Camera, level: Array = UPRIGHT, grey: Bytes | None = None
+    blob: PersonBlob, camera: Camera, level: Array = UPRIGHT_FRAME, grey: Bytes | None = None
 ) -> tuple[Bytes, Bytes | None]:
     """Mask (h, w) of the person, 1 inside, in the camera turned to the middle of the box.
 
@@ -219,17 +223,17 @@ def centred_view(
     left, top, right, bottom = blob.box
     middle = np.array([0.5 * (left + right), 0.5 * (top + bottom)])
     axis = camera.rays(middle)
-    upright = np.array_equal(level, UPRIGHT)
-    if upright and not camera.distortion and axis[2] > elementary.cos(STRAIGHT):
+    upright = np.array_equal(level, UPRIGHT_FRAME)
+    if upright and not camera.distortion and axis[2] > elementary.cos(MAX_STRAIGHT_ANGLE):
         return blob.mask, grey
     corners = np.array([[x, y] for x in (left, middle[0], right) for y in (top, middle[1], bottom)])
     # From the view to the camera.
     turn = product(level, ray_rotations(product(axis[None], level))[0])
     seen = product(camera.rays(corners), turn)
     reach = float(np.abs(seen[:, :2] / np.maximum(seen[:, 2:], 0.1)).max())
-    focal = 0.5 * FILLED * SIDE / reach
-    centre = 0.5 * (SIDE - 1)
-    across = (np.arange(SIDE) - centre) / focal
+    focal = 0.5 * FILLED_FRACTION * VIEW_SIDE / reach
+    centre = 0.5 * (VIEW_SIDE - 1)
+    across = (np.arange(VIEW_SIDE) - centre) / focal
     rays = np.array([x * across + y * across[:, None] + z for x, y, z in turn])
     pixels, _ = camera.project_with_derivative(rays, derivative=False)
     pixels = np.where(np.isfinite(pixels), pixels, -1e4).astype(np.float32)

@@ -24,9 +24,9 @@ CELLS, ANGLES = 8, 4
 SCALES = (1.5, 3.0)
 EDGES = len(SCALES) * CELLS * CELLS * ANGLES
 # Minimum distance of a pixel to the outline, px.
-ERODED = 3.0
+MIN_OUTLINE_DISTANCE = 3.0
 # Minimum range of grey levels, from the 10th to the 90th percentile.
-LEAST_CONTRAST = 20.0
+MIN_CONTRAST = 20.0
 
 
 def internal_edges(grey: Bytes, mask: Bytes, centre: tuple[float, float], width: float) -> Array:
@@ -40,12 +40,12 @@ def internal_edges(grey: Bytes, mask: Bytes, centre: tuple[float, float], width:
     inside = mask > 0
     bordered = cv2.copyMakeBorder(mask, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
     distances = cv2.distanceTransform(bordered, cv2.DIST_L2, 3)[1:-1, 1:-1]
-    rows, columns = np.nonzero(distances > ERODED)
+    rows, columns = np.nonzero(distances > MIN_OUTLINE_DISTANCE)
     result = np.zeros((len(SCALES), CELLS * CELLS * ANGLES))
     if not len(rows):
         return result.ravel()
     low, high = np.percentile(grey[inside], (10, 90))
-    contrast = max(float(high - low), LEAST_CONTRAST)
+    contrast = max(float(high - low), MIN_CONTRAST)
     across, down = (
         np.clip((at - middle) / width * CELLS + 0.5 * CELLS, 0, CELLS - 1).astype(np.intp)
         for at, middle in ((columns, centre[0]), (rows, centre[1]))

@@ -45,14 +45,14 @@ from hmt_ros.inference.linear_algebra import product
 
 Bytes = NDArray[np.uint8]
 
-RADIAL, ANGULAR = 5, 12
+RADIAL_BINS, ANGULAR_BINS = 5, 12
 RADII = (1 / 8, 3.0)  # smallest and largest radius, in mean distances between points
-VOTES = 4  # number of centres that a context votes for
-LEAST_DISTANCE = 1e-3  # lower bound of the distance in the weight of a vote
+VOTES_PER_CONTEXT = 4  # number of centres that a context votes for
+MIN_DISTANCE = 1e-3  # lower bound of the distance in the weight of a vote
 
 PAIR_DISTANCES, PAIR_ANGLES = 6, 8
 PAIR_BINS = PAIR_DISTANCES * PAIR_ANGLES
-BETWEEN = (0.5, 0.25, 0.75)  # positions along a connection that must lie inside
+CONNECTION_POSITIONS = (0.5, 0.25, 0.75)  # positions along a connection that must lie inside
 
 
 def shape_contexts(points: Array) -> Array:
@@ -67,14 +67,16 @@ def shape_contexts(points: Array) -> Array:
     mean = distance.sum() / max(n * (n - 1), 1)
     low, high = RADII
     with np.errstate(divide='ignore'):
-        radial = elementary.log(distance / (mean * low)) * (RADIAL / elementary.log(high / low))
+        radial = elementary.log(distance / (mean * low)) * (
+            RADIAL_BINS / elementary.log(high / low)
+        )
     ring = np.floor(np.maximum(radial, -1.0)).astype(np.intp)
-    angle = elementary.arctan2(off[..., 1], off[..., 0]) * (ANGULAR / (2 * np.pi))
-    sector = np.floor(angle).astype(np.intp) % ANGULAR
-    inside = (ring >= 0) & (ring < RADIAL)
-    bins = np.arange(n)[:, None] * (RADIAL * ANGULAR) + ring * ANGULAR + sector
-    counts = np.bincount(bins[inside], minlength=n * RADIAL * ANGULAR)
-    return counts.reshape(n, RADIAL * ANGULAR) / max(n - 1, 1)
+    angle = elementary.arctan2(off[..., 1], off[..., 0]) * (ANGULAR_BINS / (2 * np.pi))
+    sector = np.floor(angle).astype(np.intp) % ANGULAR_BINS
+    inside = (ring >= 0) & (ring < RADIAL_BINS)
+    bins = np.arange(n)[:, None] * (RADIAL_BINS * ANGULAR_BINS) + ring * ANGULAR_BINS + sector
+    counts = np.bincount(bins[inside], minlength=n * RADIAL_BINS * ANGULAR_BINS)
+    return counts.reshape(n, RADIAL_BINS * ANGULAR_BINS) / max(n - 1, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,17 +95,18 @@ class ShapeContextCodebook:
     def __post_init__(self) -> None:
         shape = self.centres.shape
         require(
-            shape[1:] == (RADIAL * ANGULAR,) and np.isfinite(self.centres).all(),
-            f'centres of shape contexts must be finite and (C, {RADIAL * ANGULAR}), saw {shape}',
+            shape[1:] == (RADIAL_BINS * ANGULAR_BINS,) and np.isfinite(self.centres).all(),
+            f'centres of shape contexts must be finite and (C, {RADIAL_BINS * ANGULAR_BINS}), '
+            f'saw {shape}',
         )
 
     def histogram(self, contexts: Array) -> Array:
         """Votes (C,) of contexts (N, 60): a histogram that sums to 1."""
         squared = squared_distances(np.sqrt(contexts), self.centres)
-        votes = min(VOTES, len(self.centres))
+        votes = min(VOTES_PER_CONTEXT, len(self.centres))
         nearest = smallest_columns(squared, votes)
         distance = np.sqrt(np.take_along_axis(squared, nearest, axis=1))
-        weight = 1.0 / np.maximum(distance, LEAST_DISTANCE)
+        weight = 1.0 / np.maximum(distance, MIN_DISTANCE)
         weight /= weight.sum(1, keepdims=True)
         counts = np.bincount(nearest.ravel(), weight.ravel(), len(self.centres))
         return np.asarray(counts / len(contexts), dtype=np.float64)
@@ -126,7 +129,7 @@ def edge_pairs(points: Array, directions: Array, mask: Bytes) -> Array:
     mean = max(float(distance.mean()), 1e-9)
     height, width = mask.shape
     inside = np.ones(len(off), dtype=bool)
-    for share in BETWEEN:  # smoothed outlines never leave the mask
+    for share in CONNECTION_POSITIONS:  # smoothed outlines never leave the mask
         column, row = (start + share * off + 0.5).astype(np.int32).T
         inside &= mask[np.minimum(row, height - 1), np.minimum(column, width - 1)] > 0
     low, high = RADII
@@ -147,12 +150,17 @@ def _pairs(count: int) -> tuple[Index, Index]:
 
 
 SIZE = 128  # longer side of the resized person, px
-MAP = 16  # number of cells per side of the map of distances
-EXTENT = 4.4  # width of the map in radii of gyration, enough for stretched arms and legs
-DEEPEST, FURTHEST = 0.25, 0.60  # limits of the distances inside and outside, radii of gyration
+MAP_SIDE = 16  # number of cells per side of the map of distances
+MAP_EXTENT = 4.4  # width of the map in radii of gyration, enough for stretched arms and legs
+MAX_INNER_DISTANCE, MAX_OUTER_DISTANCE = (
+    0.25,
+    0.60,
+)  # limits of the distances inside and outside, radii of gyration
 MOMENTS = 12
-FIXED = PAIR_BINS + MAP * MAP + MOMENTS + EDGES  # number of features other than shape contexts
-FEWEST_POINTS, MOST_POINTS = 8, 500  # on the outline; costs grow with the square
+FIXED_FEATURES = (
+    PAIR_BINS + MAP_SIDE * MAP_SIDE + MOMENTS + EDGES
+)  # number of features other than shape contexts
+MIN_POINTS, MAX_POINTS = 8, 500  # on the outline; costs grow with the square
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +170,8 @@ class SilhouetteParts:
     Attributes:
         contexts: (n, 60) shape contexts of the points of the outline.
         edge_pairs: (48,) histogram.
-        distances: (MAP * MAP,) signed distances to the outline, positive inside, radii of gyration.
+        distances: (MAP_SIDE * MAP_SIDE,) signed distances to the outline, positive inside, radii of
+            gyration.
         moments: (12,) second and third moments, proportions.
         edges: (EDGES,) see `internal_edges`; NaN: unknown.
     """
@@ -225,14 +234,14 @@ class SilhouetteDescriptor:
         for name in ('scale', 'centre', 'basis'):
             finite = np.isfinite(getattr(self, name)).all()
             require(finite, f'{name} of the descriptor must be finite')
-        length = len(self.codebook.centres) + FIXED
+        length = len(self.codebook.centres) + FIXED_FEATURES
         shapes = (self.scale.shape, self.centre.shape, self.basis.shape[:1])
         require(
             shapes == ((length,),) * 3 and self.basis.ndim == 2,
             f'arrays of the descriptor have shapes {shapes}, wanted ({length},)',
         )
-        right = type(self.points) is int and FEWEST_POINTS <= self.points <= MOST_POINTS
-        require(right, f'wanted {FEWEST_POINTS} to {MOST_POINTS} points on the outline')
+        right = type(self.points) is int and MIN_POINTS <= self.points <= MAX_POINTS
+        require(right, f'wanted {MIN_POINTS} to {MAX_POINTS} points on the outline')
 
     @property
     def size(self) -> int:
@@ -302,12 +311,12 @@ def _interpolated(values: Array, rows: Array, columns: Array) -> Array:
 
 
 def _map_and_moments(mask: Bytes) -> tuple[Array, Array, tuple[float, float], float]:
-    """Signed distances (MAP * MAP,) around the centroid, moments (MOMENTS,), centroid and width."""
+    """Signed distances (MAP_SIDE^2,) around the centroid, moments, centroid and width."""
     m = cv2.moments(mask, binaryImage=True)
     area = m['m00']
     x, y = m['m10'] / area, m['m01'] / area
     radius = np.sqrt((m['mu20'] + m['mu02']) / area)
-    half = 0.5 * EXTENT * radius
+    half = 0.5 * MAP_EXTENT * radius
     # Pad the mask to hold the whole map.
     height, width = mask.shape
     left, top = (max(int(half - at) + 2, 2) for at in (x, y))
@@ -315,9 +324,9 @@ def _map_and_moments(mask: Bytes) -> tuple[Array, Array, tuple[float, float], fl
     wide = cv2.copyMakeBorder(mask, top, bottom, left, right, cv2.BORDER_CONSTANT, value=0)
     inside = cv2.distanceTransform(wide, cv2.DIST_L2, 3)
     outside = cv2.distanceTransform(1 - wide, cv2.DIST_L2, 3)
-    distance = np.clip((inside - outside) / radius, -FURTHEST, DEEPEST)
-    scale = MAP / (2 * half)
-    steps = (np.arange(MAP) - (0.5 * MAP - 0.5)) / scale
+    distance = np.clip((inside - outside) / radius, -MAX_OUTER_DISTANCE, MAX_INNER_DISTANCE)
+    scale = MAP_SIDE / (2 * half)
+    steps = (np.arange(MAP_SIDE) - (0.5 * MAP_SIDE - 0.5)) / scale
     cells = _interpolated(distance, y + top + steps, x + left + steps)
     second = np.array([m['mu20'], m['mu02'], m['mu11']]) / (area * radius**2)
     third = np.array([m['mu30'], m['mu21'], m['mu12'], m['mu03']]) / (

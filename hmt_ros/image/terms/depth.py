@@ -30,7 +30,7 @@ from hmt_ros.image.terms.image_term import (
 )
 
 # Range of depths that sensors measure, m; other depths are no evidence.
-NEAREST, FURTHEST = 0.2, 20.0
+MIN_DEPTH, MAX_DEPTH = 0.2, 20.0
 
 
 class DepthInputs(NamedTuple):
@@ -46,7 +46,7 @@ NO_DEPTHS = ImageMap(np.zeros((1, 2, 2), np.float32))
 def usable_depths(depth: NDArray[np.floating]) -> NDArray[np.float32]:
     """A depth image (H, W), m, with 0 for missing depths and depths out of range."""
     with np.errstate(invalid='ignore'):
-        good = (depth >= NEAREST) & (depth <= FURTHEST)
+        good = (depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)
     result: NDArray[np.float32] = np.where(good, depth, 0.0).astype(np.float32)
     return result
 

@@ -16,7 +16,7 @@ from hmt_ros import core
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.image_term import (
     NO_MAP,
-    NOTHING,
+    NO_MASK,
     ImageTerm,
     ImageWindow,
     TermSettings,
@@ -25,7 +25,7 @@ from hmt_ros.image.terms.image_term import (
 
 ORIENTATIONS: int = core.ORIENTATIONS
 # Canny's thresholds.
-EDGE_LOW, EDGE_HIGH = 40.0, 100.0
+CANNY_LOW, CANNY_HIGH = 40.0, 100.0
 # Distance outside the silhouette beyond which edges belong to the background, px.
 MARGIN = 4
 _DISC = np.array(
@@ -36,7 +36,7 @@ _DISC = np.array(
     dtype=np.uint8,
 )
 # Assumed distance to an edge at pixels where another person hides the edges, px.
-HIDDEN = 2.0
+HIDDEN_EDGE_DISTANCE = 2.0
 
 
 class EdgeInputs(NamedTuple):
@@ -52,11 +52,11 @@ def edge_distances(window: ImageWindow) -> ImageMap:
     grey = cv2.GaussianBlur(grey, (0, 0), 1.0)
     dx = cv2.Sobel(grey, cv2.CV_16S, 1, 0)
     dy = cv2.Sobel(grey, cv2.CV_16S, 0, 1)
-    edges = cv2.Canny(dx, dy, EDGE_LOW, EDGE_HIGH)
-    near = NOTHING if window.widest is None else cv2.dilate(window.widest, _DISC)
-    others = NOTHING if window.others is None else window.others
+    edges = cv2.Canny(dx, dy, CANNY_LOW, CANNY_HIGH)
+    near = NO_MASK if window.widest is None else cv2.dilate(window.widest, _DISC)
+    others = NO_MASK if window.others is None else window.others
     result = np.empty((ORIENTATIONS, *grey.shape), dtype=np.float32)
-    core.edge_distances(edges, dx, dy, near, others, HIDDEN, result)
+    core.edge_distances(edges, dx, dy, near, others, HIDDEN_EDGE_DISTANCE, result)
     return window.as_map(result)
 
 

@@ -18,7 +18,7 @@ from hmt_ros.image.sampling import ImageMap
 from hmt_ros.inference.arrays import Array, Image
 
 # An absent mask, and an absent map.
-NOTHING = np.zeros((0, 0), np.uint8)
+NO_MASK = np.zeros((0, 0), np.uint8)
 NO_MAP = ImageMap(np.zeros((2, 2, 2), np.float32))
 # Factors on the energies at segments if all are 1.
 NO_FACTORS = np.zeros(0)

@@ -47,11 +47,11 @@ USUAL_EXTENT = 1.4
 # Stature of the person for whom the landmark offsets of the table hold, m.
 USUAL_STATURE = 1.7
 # Minimum standard deviation of a keypoint whose noise is learned, px.
-SMALLEST_SIGMA = 1.5
+MIN_SIGMA = 1.5
 # Factor on the energy of a mixture over lifted poses, because errors of joints are correlated; and
 # scale of its kernel, in standard deviations, because limbs of lifted poses may be wrong. Both were
 # chosen together with the time constant of `ERRORS['lifted']`.
-LIFTED_WEIGHT, LIFTED_SCALE = 0.1, 3.0
+LIFTED_WEIGHT, LIFTED_KERNEL = 0.1, 3.0
 # Groups of landmarks that change sides together, and the groups (E, G) that change sides in each
 # exchange: none, all, arms, legs.
 CENTRE, ARMS, LEGS = range(3)
@@ -172,7 +172,7 @@ class Keypoints:
                 offsets[row], sigma[row] = size * mark.offset, mark.sigma
         unknown = ~np.isfinite(known.covariances).all((1, 2))
         covariances = known.covariances.copy()
-        covariances[unknown] = SMALLEST_SIGMA**2 * np.eye(2)
+        covariances[unknown] = MIN_SIGMA**2 * np.eye(2)
         noise = None
         if unknown.any():
             by_confidence = noise_of(known.confidences)
@@ -456,7 +456,7 @@ def _lifted(skeleton: Skeleton, poses: LiftedPoses | None, sigma: float) -> Lift
         np.ascontiguousarray(1.0 / deviations),
         EXCHANGED.min(1),
         LIFTED_WEIGHT,
-        LIFTED_SCALE,
+        LIFTED_KERNEL,
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from hmt_ros.core import sample_outline
 from hmt_ros.image.terms.image_term import (
-    NOTHING,
+    NO_MASK,
     ImageTerm,
     ImageWindow,
     TermSettings,
@@ -27,7 +27,7 @@ from hmt_ros.inference.arrays import Array
 # Approximate number of samples on the outline.
 OUTLINE_POINTS = 120
 # Minimum length of an outline that is sampled, px.
-SHORTEST = 12
+MIN_OUTLINE_LENGTH = 12
 
 
 class Outline(NamedTuple):
@@ -66,7 +66,7 @@ def outline(window: ImageWindow, count: int = OUTLINE_POINTS) -> Outline | None:
     if mask is None:
         return None
     contours, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    contours = [c for c in contours if len(c) >= SHORTEST]
+    contours = [c for c in contours if len(c) >= MIN_OUTLINE_LENGTH]
     if not contours:
         return NO_OUTLINE
     most = count + 4 * len(contours)
@@ -75,8 +75,8 @@ def outline(window: ImageWindow, count: int = OUTLINE_POINTS) -> Outline | None:
         np.concatenate(contours)[:, 0],
         np.cumsum([len(c) for c in contours]),
         mask,
-        NOTHING if window.unsure is None else window.unsure,
-        NOTHING if window.others is None else window.others,
+        NO_MASK if window.unsure is None else window.unsure,
+        NO_MASK if window.others is None else window.others,
         count,
         window.left,
         window.top,

@@ -34,8 +34,8 @@ class Proposal(Protocol):
 # Proposals of every tracker, used before the one that the setting `proposals` selects. Each
 # proposal decides whether it applies to an image. To add a proposal, add a file in this folder and
 # a name here.
-USUAL: tuple[Proposal, ...] = (predicted_poses, reversed_poses)
-SELECTED: Mapping[str, Proposal] = MappingProxyType(
+USUAL_PROPOSALS: tuple[Proposal, ...] = (predicted_poses, reversed_poses)
+SELECTABLE_PROPOSALS: Mapping[str, Proposal] = MappingProxyType(
     {'kjs': jumped_poses, 'css': covariance_scaled_poses, 'ss': spherical_poses}
 )
 
@@ -46,9 +46,11 @@ def proposals_of(selected: str) -> tuple[Proposal, ...]:
     Raises:
         ValueError: the name is unknown.
     """
-    if selected not in SELECTED:
-        raise ValueError(f'proposals must be one of {tuple(SELECTED)}, saw {selected!r}')
-    return (*USUAL, SELECTED[selected])
+    if selected not in SELECTABLE_PROPOSALS:
+        raise ValueError(
+            f'proposals must be one of {tuple(SELECTABLE_PROPOSALS)}, saw {selected!r}'
+        )
+    return (*USUAL_PROPOSALS, SELECTABLE_PROPOSALS[selected])
 
 
 def propose(

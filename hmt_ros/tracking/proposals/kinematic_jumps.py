@@ -42,7 +42,7 @@ from hmt_ros.tracking.settings import (
 )
 
 # Change of a variable above which it has jumped, rad or m.
-STILL = float(np.sqrt(np.finfo(np.float64).eps))
+MIN_JUMP = float(np.sqrt(np.finfo(np.float64).eps))
 
 
 def find_limb(
@@ -146,7 +146,7 @@ def jumped_poses(search: Search, sources: Hypotheses, rng: np.random.Generator) 
     poses, members = poses[kept], members[kept]
     # The motion prior of a jumped variable is centred at its new value, otherwise at the
     # prediction.
-    jumped = np.abs(poses - base.x[members]) > STILL
+    jumped = np.abs(poses - base.x[members]) > MIN_JUMP
     return sources.proposed(members, poses, jumped)
 
 

@@ -33,7 +33,7 @@ from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.misfit import KEYPOINTS, Misfit, of_keypoints
 from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.settings import BODY_REACH, BODY_SPEED, REVERSAL_ITERATIONS
-from hmt_ros.tracking.validity import UNDECIDED, ByKeypoints
+from hmt_ros.tracking.validity import UNDECIDED_MISFITS, ByKeypoints
 
 
 class PoseByKeypoints:
@@ -67,9 +67,9 @@ class PoseByKeypoints:
         pose = _by_keypoints(search, self.pose)
         if self.pose is None:
             both = search.posterior.body.joint_positions(np.stack([pose[0], mode]))
-            self._gain = float(np.subtract(*search.continuity.rated(both)))
+            self._gain = float(np.subtract(*search.transition_prior.log_predictive(both)))
         self.pose = pose
-        if missed.share <= UNDECIDED[KEYPOINTS]:
+        if missed.share <= UNDECIDED_MISFITS[KEYPOINTS]:
             return None
         gain, self._gain = self._gain, 0.0
         return ByKeypoints(of_keypoints(term, pose), gain)
@@ -81,7 +81,7 @@ def predicted_poses(search: Search, sources: Hypotheses, _rng: np.random.Generat
         return sources[:0]
     poses = search.prediction.seen_as(search.posterior.person).means
     joints = search.posterior.body.joint_positions(poses)
-    nearest = search.continuity.log_transitions(joints).argmax(0)
+    nearest = search.transition_prior.log_transitions(joints).argmax(0)
     return sources.proposed(nearest, poses, np.ones(poses.shape, dtype=np.bool_))
 
 
@@ -100,7 +100,7 @@ def keypoint_poses(search: Search, sources: Hypotheses) -> Hypotheses:
     if not _misses_a_group(of_keypoints(term, search.base.x[:1])):
         return sources[:0]
     pose = _by_keypoints(search, None)
-    moved = np.linalg.norm(pose[:, :3] - search.continuity.predicted[:1, :3], axis=1)
+    moved = np.linalg.norm(pose[:, :3] - search.transition_prior.predicted[:1, :3], axis=1)
     if moved[0] > BODY_REACH + BODY_SPEED * search.dt:
         return sources[:0]
     first = np.zeros(1, dtype=np.intp)
@@ -120,13 +120,13 @@ def reversed_poses(search: Search, sources: Hypotheses, _rng: np.random.Generato
 
 
 def _misses_a_group(missed: Misfit) -> bool:
-    return bool((missed.shares[missed.counts > 0] > UNDECIDED[KEYPOINTS]).any())
+    return bool((missed.shares[missed.counts > 0] > UNDECIDED_MISFITS[KEYPOINTS]).any())
 
 
 def _by_keypoints(search: Search, before: Array | None) -> Array:
     """Fits the pose x' (1, d) to the keypoints of an image."""
     posterior = search.posterior
-    first = search.continuity.predicted[:1] if before is None else before
+    first = search.transition_prior.predicted[:1] if before is None else before
     placing = posterior.placing(search.observation)
     assert placing is not None
     term = replace(placing, motion=Quadratic(first, search.precisions[:1]))

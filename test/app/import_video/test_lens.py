@@ -5,7 +5,7 @@ import struct
 
 import pytest
 
-from hmt_ros.app.import_video.lens import KEY, told_fov
+from hmt_ros.app.import_video.lens import KEY, metadata_fov
 
 MAKE = b'com.apple.quicktime.make'
 
@@ -35,7 +35,7 @@ def told(tmp_path):
     def write(*boxes):
         path = tmp_path / 'video.mov'
         path.write_bytes(b''.join([box(b'ftyp', b'qt  '), *boxes]))
-        return told_fov(path)
+        return metadata_fov(path)
 
     return write
 

@@ -62,7 +62,7 @@ def test_every_bag_gets_one_of_its_name(archive, tracked, tmp_path):
 
 
 def test_bags_that_are_done_are_skipped(archive, tracked, monkeypatch, capsys):
-    def never(source, target, options, tell, **shown):
+    def never(source, target, options, notify, **shown):
         raise AssertionError
 
     before = {path: path.stat().st_mtime_ns for path in tracked.rglob('*')}
@@ -94,7 +94,7 @@ def test_what_was_left_half_done_is_done_anew(archive, tracked, tmp_path, monkey
     usual = many_bags.replay_bag
     begun = []
 
-    def killed(source, target, options, tell, **shown):
+    def killed(source, target, options, notify, **shown):
         """Leaves the files of a process that is killed in its second bag."""
         if begun:
             folder = target.with_name(f'.{target.name}.0123abcd.partial') / target.name
@@ -102,7 +102,7 @@ def test_what_was_left_half_done_is_done_anew(archive, tracked, tmp_path, monkey
             (folder / 'b.mcap').write_bytes(b'half')
             raise KeyboardInterrupt
         begun.append(target.name)
-        return usual(source, target, options, tell, **shown)
+        return usual(source, target, options, notify, **shown)
 
     monkeypatch.setattr(many_bags, 'replay_bag', killed)
     assert main(command) == 130

@@ -10,7 +10,7 @@ import pytest
 from hmt_ros.app.evaluate import score_bag
 from hmt_ros.app.report import command as report
 from hmt_ros.app.report.images import ImageSource, film_strip
-from hmt_ros.app.report.mixtures import ENDS, KEPT_TRAJECTORIES, read_mixtures
+from hmt_ros.app.report.mixtures import MAX_TRAJECTORIES, PATH_JOINTS, read_mixtures
 from hmt_ros.app.report.page import data_size
 from hmt_ros.app.truth import read_truth
 from msg_tools import BagReader, BagWriter
@@ -84,7 +84,7 @@ def test_beliefs_are_those_of_the_bag(data, body, poses, tmp_path):
 
 def test_trajectories_are_those_of_the_bag(made, data, body):
     (topic,) = data['trajectories']
-    assert topic['ends'] == list(ENDS)
+    assert topic['ends'] == list(PATH_JOINTS)
     with BagReader(made.out) as bag:
         messages = [stored.message for stored in bag.messages(['trajectory_mixture'])]
     assert len(topic['windows']) == len(messages) == FRAMES
@@ -93,9 +93,9 @@ def test_trajectories_are_those_of_the_bag(made, data, body):
         assert np.allclose(window['free_energy'], message.free_energy, atol=1e-4)
         steps = len(message.stamps)
         assert len(window['times']) == steps
-        means = [c.means.reshape(steps, -1) for c in message.components[:KEPT_TRAJECTORIES]]
+        means = [c.means.reshape(steps, -1) for c in message.components[:MAX_TRAJECTORIES]]
         joints = body.joint_positions(np.concatenate(means))
-        ways = joints[:, body.skeleton.joint_index(ENDS)]
+        ways = joints[:, body.skeleton.joint_index(PATH_JOINTS)]
         found = positions(data, window['ways'], *ways.shape[:2])
         assert np.abs(found - ways).max() < 3e-4
 

@@ -6,11 +6,11 @@ import pytest
 from hmt_learning.training.descriptor_learning import learned_codebook
 from hmt_ros.experts.descriptor.contour import sample_contour
 from hmt_ros.experts.descriptor.silhouette_descriptor import (
-    ANGULAR,
+    ANGULAR_BINS,
     PAIR_ANGLES,
     PAIR_BINS,
     PAIR_DISTANCES,
-    RADIAL,
+    RADIAL_BINS,
     RADII,
     ShapeContextCodebook,
     edge_pairs,
@@ -27,15 +27,15 @@ def test_contexts_count_points_by_distance_and_direction() -> None:
     found = shape_contexts(points)
     gaps = np.linalg.norm(points[:, None] - points[None], axis=2)
     mean = gaps.sum() / (60 * 59)
-    edges = mean * RADII[0] * (RADII[1] / RADII[0]) ** (np.arange(RADIAL + 1) / RADIAL)
+    edges = mean * RADII[0] * (RADII[1] / RADII[0]) ** (np.arange(RADIAL_BINS + 1) / RADIAL_BINS)
     for i in (0, 17, 59):
-        wanted = np.zeros((RADIAL, ANGULAR))
+        wanted = np.zeros((RADIAL_BINS, ANGULAR_BINS))
         for j in range(60):
             d = points[j] - points[i]
             ring = np.searchsorted(edges, np.linalg.norm(d), side='right') - 1
-            if j != i and 0 <= ring < RADIAL:
+            if j != i and 0 <= ring < RADIAL_BINS:
                 turn = np.arctan2(d[1], d[0]) % (2 * np.pi)
-                wanted[ring, int(turn / (2 * np.pi) * ANGULAR)] += 1 / 59
+                wanted[ring, int(turn / (2 * np.pi) * ANGULAR_BINS)] += 1 / 59
         np.testing.assert_allclose(found[i], wanted.ravel(), atol=1e-12)
 
 

@@ -2,7 +2,7 @@ import unicodedata
 
 import pytest
 
-from msg_tools.files.error_line import LONGEST_LINE, error_line, one_line, printable
+from msg_tools.files.error_line import MAX_LINE, error_line, one_line, printable
 
 
 @pytest.mark.parametrize(
@@ -31,11 +31,11 @@ def test_no_character_passes_that_has_no_shape():
 
 @pytest.mark.parametrize('middle', ['x' * 10**6, '\x1b' * 10**6, ' ' * 10**6, '\udcff\n' * 10**5])
 def test_long_text_keeps_its_start_and_its_end(middle):
-    line = one_line(f'/data/walk.mcap: {middle}; give another', LONGEST_LINE)
-    assert len(line) <= LONGEST_LINE
+    line = one_line(f'/data/walk.mcap: {middle}; give another', MAX_LINE)
+    assert len(line) <= MAX_LINE
     assert line.startswith('/data/walk.mcap: ')
     assert line.endswith('; give another')
-    assert one_line(line, LONGEST_LINE) == line
+    assert one_line(line, MAX_LINE) == line
 
 
 def test_errors_without_a_text_give_their_type():

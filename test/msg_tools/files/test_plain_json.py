@@ -40,6 +40,6 @@ def test_memory_is_counted_before_it_is_spent(part, monkeypatch):
     needed = load_plain_json(text)
     assert len(needed) == 1001
     # A value takes 24 bytes at least, and its place in a list eight.
-    monkeypatch.setattr(plain_json, 'LARGEST', 24 * 1000)
+    monkeypatch.setattr(plain_json, 'MAX_MEMORY_BYTES', 24 * 1000)
     with pytest.raises(ValueError, match='bytes, wanted at most 24000'):
         load_plain_json(text)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from hmt_ros.body import load_body, model_names, named_body
-from msg_tools.files.plain_yaml import MOST_NODES, load_plain_yaml
+from msg_tools.files.plain_yaml import MAX_NODES, load_plain_yaml
 
 MODEL = Path(__file__).resolve().parents[3] / 'hmt_ros' / 'body' / 'models' / 'human37.yaml'
 BOMB = 'a: &a [x, x, x, x, x, x, x, x, x, x]\n' + ''.join(
@@ -36,10 +36,10 @@ def test_plain_documents():
         ('a: 2000-99-99', 'month must be in'),
         ('a: \x00', 'special characters are not allowed'),
         ('a: 1\n---\nb: 2\n', 'single document'),
-        ('a: [' + '1,' * MOST_NODES + ']', 'line 1: more than 20000 values'),
-        ('- a\n' * MOST_NODES, 'more than 20000 values'),
-        ('?\n' * MOST_NODES, 'more than 20000 values'),
-        ('{' + '<<: {},' * MOST_NODES + '}', 'more than 20000 values'),
+        ('a: [' + '1,' * MAX_NODES + ']', 'line 1: more than 20000 values'),
+        ('- a\n' * MAX_NODES, 'more than 20000 values'),
+        ('?\n' * MAX_NODES, 'more than 20000 values'),
+        ('{' + '<<: {},' * MAX_NODES + '}', 'more than 20000 values'),
         ('a: ' + '9' * 101, 'a number of 101 characters'),
         ('a: 1' + ':1' * 50_000, 'a number of 100001 characters'),
         ('a: 0x' + 'f' * 1000, 'a number of 1002 characters'),

@@ -69,9 +69,9 @@ def test_fisheye_projects_as_opencv():
 
 def test_a_distortion_that_folds_in_the_corners_is_told():
     told: list[str] = []
-    camera_from_info(info(d=np.array([0.17, -0.3, 0.0, 0.0, 0.0])), tell=told.append)
+    camera_from_info(info(d=np.array([0.17, -0.3, 0.0, 0.0, 0.0])), notify=told.append)
     assert told == []
-    camera_from_info(info(d=np.array([-0.34, 0.0, 0.0, 0.0, 0.0])), tell=told.append)
+    camera_from_info(info(d=np.array([-0.34, 0.0, 0.0, 0.0, 0.0])), notify=told.append)
     (line,) = told
     # It folds at 2 / 3 of the ideal radius, where 1 - 1.02 r^2 is 0; a corner lies at 0.677.
     assert re.search('beyond 9[678]% of the way to a corner', line)

@@ -10,8 +10,8 @@ from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons, person
 from msg_tools.files.array_file import read_archive
 from msg_tools.files.budget import Budget
 
-_LARGEST = 2**28  # maximum size, bytes; an archive of an hour has 10**8
-_RECORDS = 10  # cost of a person in the budget, records
+_MAX_BYTES = 2**28  # maximum size, bytes; an archive of an hour has 10**8
+_RECORDS_PER_PERSON = 10  # cost of a person in the budget, records
 
 
 def read_arrays(path: Path) -> FoundPersons:
@@ -20,7 +20,7 @@ def read_arrays(path: Path) -> FoundPersons:
     Raises:
         ValueError: not an archive, no keypoints in it, or contradictory shapes of arrays.
     """
-    content = read_archive(path, _LARGEST)
+    content = read_archive(path, _MAX_BYTES)
     budget = Budget(path.stat().st_size)
     if 'pixels' not in content:
         raise ValueError('no array pixels; wanted pixels and landmark_names')
@@ -30,7 +30,7 @@ def read_arrays(path: Path) -> FoundPersons:
     names = None if given is None else tuple(given.flat)
     if names is not None and not all(isinstance(x, str) for x in names):
         raise ValueError('landmark_names has entries that are not texts')
-    budget.spend(records=_RECORDS * rows)
+    budget.spend(records=_RECORDS_PER_PERSON * rows)
     shapes = {
         'pixels': (rows, n, 2),
         'visibility': (rows, n),

@@ -12,17 +12,17 @@ from hmt_ros.app.import_video.frames import natural_order
 from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons, Person
 from msg_tools.messages.headers import SECOND_NS
 
-LARGEST, NEAREST, INDEX, TRACK = 'largest', 'nearest', 'index', 'id'
-AT, LONGEST = 'at', 'track'
+BY_SIZE, BY_DISTANCE, BY_INDEX, BY_ID = 'largest', 'nearest', 'index', 'id'
+BY_PLACE, BY_LENGTH = 'at', 'track'
 # Maximum motion of a person from frame to frame, in diagonals of their box.
-_FASTEST = 0.5
+_MAX_MOTION = 0.5
 # Margin around the box of a person within which a point selects them, in diagonals of the box.
-_AROUND = 0.15
+_BOX_MARGIN = 0.15
 # Maximum number of frames without the person before a track ends.
-_PATIENCE = 30
+_MAX_ABSENCE = 30
 # Maximum number of person-track pairs compared in a clip: a constant, and an addition per person.
-_FREE_PAIRS, _PAIRS = 20_000, 100
-_LISTED = 8  # maximum number of names in an error message
+_FREE_PAIRS, _PAIRS_PER_PERSON = 20_000, 100
+_MAX_LISTED_NAMES = 8  # maximum number of names in an error message
 
 
 @dataclass(frozen=True)
@@ -30,16 +30,16 @@ class Choice:
     """The choice of the person to track among several.
 
     Attributes:
-        kind: `LARGEST`: the largest box in each frame. `NEAREST`: the largest person in the first
-            frame, then the person nearest to the previous one. `INDEX`: an index in the list of
-            each frame. `TRACK`: the name from the detector. `AT`: the person at an image point at a
-            time, then the nearest before and after. `LONGEST`: a rank among the tracks of the clip,
-            the longest first.
+        kind: `BY_SIZE`: the largest box in each frame. `BY_DISTANCE`: the largest person in the
+            first frame, then the person nearest to the previous one. `BY_INDEX`: an index in the
+            list of each frame. `BY_ID`: the name from the detector. `BY_PLACE`: the person at an
+            image point at a time, then the nearest before and after. `BY_LENGTH`: a rank among the
+            tracks of the clip, the longest first.
         value: the index, rank or name.
         point: column and row, px, and time since the first frame, s.
     """
 
-    kind: str = NEAREST
+    kind: str = BY_DISTANCE
     value: str = ''
     point: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -51,13 +51,13 @@ class Choice:
             ValueError: the text is not a choice.
         """
         kind, colon, value = text.partition(':')
-        if kind in (LARGEST, NEAREST) and not colon:
+        if kind in (BY_SIZE, BY_DISTANCE) and not colon:
             return cls(kind)
-        if kind == TRACK and value:
+        if kind == BY_ID and value:
             return cls(kind, value)
-        if value.isdecimal() and (kind == INDEX or (kind == LONGEST and int(value) > 0)):
+        if value.isdecimal() and (kind == BY_INDEX or (kind == BY_LENGTH and int(value) > 0)):
             return cls(kind, value)
-        if kind == AT:
+        if kind == BY_PLACE:
             try:
                 place = [float(x) for x in value.split(',')]
             except ValueError:
@@ -78,13 +78,13 @@ def chosen_person(
 
     Args:
         first: key of the first frame to search.
-        rate: frames per second; needed only for `AT` with a time if frames are numbered.
+        rate: frames per second; needed only for `BY_PLACE` with a time if frames are numbered.
 
     Raises:
         ValueError: no person matches the choice; the text lists alternatives.
     """
     kind, value = choice.kind, choice.value
-    if kind == INDEX:
+    if kind == BY_INDEX:
         there = {k: x[int(value)] for k, x in found.frames.items() if int(value) < len(x)}
         most = max(map(len, found.frames.values()), default=0)
         if most and not there:
@@ -95,23 +95,23 @@ def chosen_person(
     likely = found.likely()
     if not any(likely.values()):
         return {}
-    if kind == TRACK:
+    if kind == BY_ID:
         return _called(found, value)
     many = found.timed and len(likely) > 1
     unit = float(np.median(np.diff([*likely]))) if many else 1.0
-    if kind == LONGEST:
+    if kind == BY_LENGTH:
         tracks = sorted(tracks_of(likely, unit), key=len, reverse=True)
         if int(value) > len(tracks):
-            text = ', '.join(str(len(x)) for x in tracks[:_LISTED])
+            text = ', '.join(str(len(x)) for x in tracks[:_MAX_LISTED_NAMES])
             raise ValueError(
                 f'no track {value}: the clip has {len(tracks)}, of {text} frames; '
                 '--person track:1 is the longest'
             )
         return tracks[int(value) - 1]
-    if kind == LARGEST:
+    if kind == BY_SIZE:
         return {key: _largest(persons) for key, persons in likely.items() if persons}
     keys = [key for key, persons in likely.items() if persons]
-    if kind == NEAREST:
+    if kind == BY_DISTANCE:
         keys = [key for key in keys if key >= first]
         if not keys:
             return {}
@@ -144,9 +144,11 @@ def _called(found: FoundPersons, name: str) -> dict[int, Person]:
 
 
 def _names_in(found: FoundPersons) -> str:
-    """The names of the persons in a file as text, cut off after `_LISTED` names."""
+    """The names of the persons in a file as text, cut off after `_MAX_LISTED_NAMES` names."""
     names = sorted({x.track for x in found.persons()} - {''}, key=natural_order)
-    return ', '.join(x[:40] for x in names[:_LISTED]) + (', ...' if len(names) > _LISTED else '')
+    return ', '.join(x[:40] for x in names[:_MAX_LISTED_NAMES]) + (
+        ', ...' if len(names) > _MAX_LISTED_NAMES else ''
+    )
 
 
 def _person_at(persons: Sequence[Person], column: float, row: float) -> Person:
@@ -156,8 +158,8 @@ def _person_at(persons: Sequence[Person], column: float, row: float) -> Person:
     middles = (low + high) / 2
     outside = np.linalg.norm(np.maximum(0.0, np.maximum(low - point, point - high)), axis=1)
     best = np.lexsort((np.linalg.norm(middles - point, axis=1), outside))[0]
-    if outside[best] > _AROUND * persons[best].size:
-        text = ' and '.join(f'at:{x:.0f},{y:.0f}' for x, y in middles[:_LISTED])
+    if outside[best] > _BOX_MARGIN * persons[best].size:
+        text = ' and '.join(f'at:{x:.0f},{y:.0f}' for x, y in middles[:_MAX_LISTED_NAMES])
         raise ValueError(f'nobody at {column:g},{row:g}: in this frame they are --person {text}')
     return persons[best]
 
@@ -178,8 +180,8 @@ def tracks_of(likely: Mapping[int, list[Person]], unit: float = 1.0) -> list[dic
     going: list[tuple[int, Person, dict[int, Person]]] = []
     left = _FREE_PAIRS
     for key, persons in likely.items():
-        going = [x for x in going if key - x[0] <= _PATIENCE * unit]
-        left += len(persons) * (_PAIRS - len(going))
+        going = [x for x in going if key - x[0] <= _MAX_ABSENCE * unit]
+        left += len(persons) * (_PAIRS_PER_PERSON - len(going))
         if left < 0:
             raise ValueError(f'too many persons at once to follow each: {len(going)} tracks')
         pairs = sorted(
@@ -222,4 +224,4 @@ def _followed(
 
 def _in_reach(person: Person, last: Person, gap: float) -> bool:
     """Whether the person `last` can have moved to the place of `person` in `gap` frames."""
-    return person.distance(last) <= _FASTEST * last.size * gap
+    return person.distance(last) <= _MAX_MOTION * last.size * gap

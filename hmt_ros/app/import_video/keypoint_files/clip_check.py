@@ -26,7 +26,7 @@ from itertools import pairwise
 import numpy as np
 
 from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons, Person
-from hmt_ros.app.progress import Tell
+from hmt_ros.app.progress import Notify
 from hmt_ros.image.keypoint_schemes import (
     AUTO,
     JOINTS,
@@ -43,23 +43,23 @@ from hmt_ros.inference.arrays import Array, Mask
 _SCALES = (100.0, 255.0, 1000.0)
 # Maximum median of confidences on the scale from 0 to 1.
 _FRACTIONS = 1.5
-_SMALLEST_SCALE = 10.0
+_MIN_SCALE = 10.0
 # Maximum coordinate of positions that are fractions of the image.
 _FRACTION = 2.0
 # Minimum fraction of confident points in or near the image, minimum confidence of these points, and
 # margin around the image, in image sizes. Detectors are not confident of points that they guess.
-_INSIDE, _CONFIDENT, _NEAR = 0.7, 0.5, 0.05
+_MIN_INSIDE_FRACTION, _MIN_CONFIDENCE, _IMAGE_MARGIN = 0.7, 0.5, 0.05
 # Fraction of width and height that contains all points only if they are from smaller images.
-_QUARTER = 0.5
-_SAME_SHAPE = 0.02
-_ENOUGH = 100  # minimum number of points for a conclusion about all points
+_REDUCED_FRACTION = 0.5
+_SHAPE_TOLERANCE = 0.02
+_MIN_POINTS = 100  # minimum number of points for a conclusion about all points
 # Minimum confidence of the ends of a bone, and minimum number of bones for a check.
-_SURE, _BONES = 0.3, 6
-_FEWEST, _MOST = 10, 2000  # minimum and maximum number of persons that are checked
+_MIN_BONE_CONFIDENCE, _MIN_BONES = 0.3, 6
+_MIN_PERSONS, _MAX_PERSONS = 10, 2000  # minimum and maximum number of persons that are checked
 _QUANTILE, _USUAL, _BELOW = 0.9, 1.18, 1.67
 # Maximum z of an accepted order of points, ratio of z below which another order replaces the usual
 # order, and maximum z of given names.
-_REFUSED, _BETTER, _NAMES_REFUSED = 2.75, 0.6, 3.5
+_MAX_Z, _MAX_Z_RATIO, _MAX_Z_OF_NAMES = 2.75, 0.6, 3.5
 # A leap: minimum mean motion of the points, in diagonals of the box; maximum distance after the
 # return, as a fraction of the leap; maximum number of frames until the return. An error: minimum
 # number of leaps, and their minimum fraction of all steps.
@@ -69,7 +69,7 @@ _LEAP, _BACK, _SOON, _LEAPS, _OFTEN = 0.2, 0.4, 10, 3, 0.1
 def check_clip(
     found: FoundPersons,
     size: tuple[int, int],
-    tell: Tell,
+    notify: Notify,
     *,
     scheme: str = AUTO,
     points_size: tuple[int, int] | None = None,
@@ -88,9 +88,9 @@ def check_clip(
     if not any(found.persons()):
         return
     try:
-        _scale_confidences(found, tell)
-        _scale_places(found, size, tell, points_size)
-        _name_points(found, tell, scheme)
+        _scale_confidences(found, notify)
+        _scale_places(found, size, notify, points_size)
+        _name_points(found, notify, scheme)
     except ValueError as error:
         raise ValueError(f'{found.path}: {error}') from error
 
@@ -98,21 +98,21 @@ def check_clip(
 def _likely(found: FoundPersons) -> list[Person]:
     """A limited number of likely persons, spread evenly over the clip."""
     persons = [x for those in found.likely().values() for x in those]
-    return persons[:: -(-len(persons) // _MOST)]
+    return persons[:: -(-len(persons) // _MAX_PERSONS)]
 
 
-def _scale_confidences(found: FoundPersons, tell: Tell) -> None:
+def _scale_confidences(found: FoundPersons, notify: Notify) -> None:
     """Scales confidences to the range from 0 to 1."""
     persons = [x.keypoints for x in _likely(found)]
     sure = np.concatenate([x.confidences[x.seen] for x in persons])
     largest, scale = float(sure.max()), 1.0
     if np.median(sure) > _FRACTIONS:
-        scale = next((x for x in _SCALES if _SMALLEST_SCALE < largest <= x), 1.0)
+        scale = next((x for x in _SCALES if _MIN_SCALE < largest <= x), 1.0)
         how = f'read as parts of {scale:g}' if scale > 1.0 else 'those above 1 are taken as 1'
-        tell(f'{found.path}: confidences up to {largest:g}: {how}')
-    equal = len(sure) >= _ENOUGH and sure.min() == largest != 1.0
+        notify(f'{found.path}: confidences up to {largest:g}: {how}')
+    equal = len(sure) >= _MIN_POINTS and sure.min() == largest != 1.0
     if equal:
-        tell(
+        notify(
             f'{found.path}: all confidences are {largest:g}: they carry no information, and are '
             'taken as 1'
         )
@@ -122,7 +122,7 @@ def _scale_confidences(found: FoundPersons, tell: Tell) -> None:
 
 
 def _scale_places(
-    found: FoundPersons, size: tuple[int, int], tell: Tell, points_size: tuple[int, int] | None
+    found: FoundPersons, size: tuple[int, int], notify: Notify, points_size: tuple[int, int] | None
 ) -> None:
     """Scales positions to pixels of the images."""
     (width, height), given = size, points_size or found.size
@@ -133,35 +133,35 @@ def _scale_places(
         factor = np.array(size, dtype=np.float64)
         if points.min() < -1.0 / _FRACTION**2:  # coordinates from -1 to 1 over the width
             factor, shift = np.full(2, width / 2), np.array(size) / 2
-        tell(f'{found.path}: positions are fractions of the image, of {width}x{height} pixels')
+        notify(f'{found.path}: positions are fractions of the image, of {width}x{height} pixels')
     elif given is not None:
-        if given[0] <= 0 or abs(given[1] / given[0] * width / height - 1.0) > _SAME_SHAPE:
+        if given[0] <= 0 or abs(given[1] / given[0] * width / height - 1.0) > _SHAPE_TOLERANCE:
             raise ValueError(
                 f'the keypoints were found in images of {given[0]}x{given[1]} pixels, but the '
                 f'frames have {width}x{height}; --keypoints-size WxH sets another size'
             )
         factor = np.array(size) / given
         if (factor != 1.0).any():
-            tell(
+            notify(
                 f'{found.path}: positions are scaled from {given[0]}x{given[1]} to {width}x{height}'
             )
     else:
         sure = np.concatenate([x.keypoints.confidences[x.keypoints.seen] for x in persons])
-        _check_places(points, sure >= min(_CONFIDENT, sure.max()), size)
+        _check_places(points, sure >= min(_MIN_CONFIDENCE, sure.max()), size)
     found.change(lambda x: replace(x, pixels=x.pixels * factor + shift))
 
 
 def _check_places(points: Array, sure: Mask, size: tuple[int, int]) -> None:
     """Raises ValueError if points (n, 2) seem to be from images of another size."""
     (width, height), shares = size, points / size
-    outside = ((shares < -_NEAR) | (shares > 1 + _NEAR)).any(1) & sure
-    if outside.sum() > (1 - _INSIDE) * sure.sum():
+    outside = ((shares < -_IMAGE_MARGIN) | (shares > 1 + _IMAGE_MARGIN)).any(1) & sure
+    if outside.sum() > (1 - _MIN_INSIDE_FRACTION) * sure.sum():
         raise ValueError(
             f'{outside.sum()} of {sure.sum()} keypoints lie outside of the images, of '
             f'{width}x{height}: found in larger images, or not upright? --keypoints-size WxH '
             'sets the size of those images'
         )
-    if len(points) >= _ENOUGH and (shares < _QUARTER).all():
+    if len(points) >= _MIN_POINTS and (shares < _REDUCED_FRACTION).all():
         raise ValueError(
             f'all keypoints lie in the upper left quarter of {width}x{height}: found in smaller '
             f'images? --keypoints-size WxH sets their size, such as {width // 2}x{height // 2}, '
@@ -169,12 +169,14 @@ def _check_places(points: Array, sure: Mask, size: tuple[int, int]) -> None:
         )
 
 
-def _name_points(found: FoundPersons, tell: Tell, scheme: str) -> None:
+def _name_points(found: FoundPersons, notify: Notify, scheme: str) -> None:
     """Names unnamed points in the order for which bones have human lengths."""
     persons = _likely(found)
     names = persons[0].keypoints.names
     alike = [x.keypoints for x in persons if x.keypoints.names == names]
-    pixels = np.stack([np.where(x.confidences[:, None] < _SURE, np.nan, x.pixels) for x in alike])
+    pixels = np.stack(
+        [np.where(x.confidences[:, None] < _MIN_BONE_CONFIDENCE, np.nan, x.pixels) for x in alike]
+    )
     orders = unnamed_orders().get(found.unnamed, ())
     if scheme != AUTO:
         if found.unnamed and scheme != JOINTS and len(schemes()[scheme].names) == len(names):
@@ -184,10 +186,10 @@ def _name_points(found: FoundPersons, tell: Tell, scheme: str) -> None:
     usual = next(iter(tried), '')
     if not tried:
         tried[usual] = bone_deviation(names, pixels)
-    if not tried[usual] > (_REFUSED if orders else _NAMES_REFUSED):
+    if not tried[usual] > (_MAX_Z if orders else _MAX_Z_OF_NAMES):
         return
     best = min(tried, key=lambda x: np.nan_to_num(tried[x], nan=math.inf))
-    if tried[best] > min(_REFUSED, _BETTER * tried[usual]):
+    if tried[best] > min(_MAX_Z, _MAX_Z_RATIO * tried[usual]):
         own = recognised(names)
         what = f'{found.unnamed} points are not in the order of {" or ".join(orders)}'
         raise ValueError(
@@ -195,7 +197,7 @@ def _name_points(found: FoundPersons, tell: Tell, scheme: str) -> None:
             f'of two people are in one list; --scheme {usual or (own.name if own else JOINTS)} '
             'accepts them as they are'
         )
-    tell(
+    notify(
         f'{found.path}: bone lengths are human in the order of {best}, not in that of {usual}; '
         f'--scheme {usual} selects the latter'
     )
@@ -221,14 +223,14 @@ def bone_deviation(names: Sequence[str], pixels: Array, scheme: str = AUTO) -> f
         for i, x in enumerate(marks)
     }
     bones = [(where[a], where[b], *x) for (a, b), x in bone_lengths().items() if {a, b} <= {*where}]
-    if len(bones) < _BONES:
+    if len(bones) < _MIN_BONES:
         return math.nan
     one, other, usual, sigma = (np.array(x) for x in zip(*bones, strict=True))
     lengths = np.linalg.norm(pixels[:, one] - pixels[:, other], axis=2)
     seen = np.isfinite(lengths)
-    kept = seen.sum(1) >= _BONES
+    kept = seen.sum(1) >= _MIN_BONES
     lengths, seen = lengths[kept], seen[kept]
-    if len(lengths) < _FEWEST:
+    if len(lengths) < _MIN_PERSONS:
         return math.nan
     scale = np.where(seen, lengths, 0.0).sum(1) / (seen * usual).sum(1)
     ratios = lengths / usual / np.maximum(scale, 1e-6)[:, None]

@@ -23,14 +23,14 @@ from hmt_ros.image.keypoint_schemes import recognised
 from hmt_ros.inference.arrays import Array
 from msg_tools.files.plain_json import load_plain_json
 
-LARGEST_FILE = 2**27  # maximum size, bytes
+MAX_FILE_BYTES = 2**27  # maximum size, bytes
 # Names of the fields of a person or a frame in all layouts.
-_POINTS = ('keypoints', 'pose_keypoints_2d', 'joints')
-_SURE = ('keypoint_scores', 'keypoints_scores', 'keypoint_score')
-_SCORE = ('score', 'bbox_score', 'confidence', 'scores')
-_TRACK = ('track_id', 'idx', 'person_id')
-_FRAME = ('image_id', 'frame_id', 'frame', 'image_name', 'file_name')
-_PERSONS = ('people', 'bodies', 'instances')
+_POINT_FIELDS = ('keypoints', 'pose_keypoints_2d', 'joints')
+_CONFIDENCE_FIELDS = ('keypoint_scores', 'keypoints_scores', 'keypoint_score')
+_SCORE_FIELDS = ('score', 'bbox_score', 'confidence', 'scores')
+_TRACK_FIELDS = ('track_id', 'idx', 'person_id')
+_FRAME_FIELDS = ('image_id', 'frame_id', 'frame', 'image_name', 'file_name')
+_PERSON_FIELDS = ('people', 'bodies', 'instances')
 
 Labelled = tuple[Any, list[Any]]
 
@@ -113,33 +113,33 @@ def frames_in(content: Any, label: Any) -> Iterator[Labelled]:
             entry = load_plain_json(entry) if isinstance(entry, str) else entry
             if not isinstance(entry, (dict, list)):
                 raise ValueError(f'entry {i} is not an object')
-            own = _get(entry, _FRAME, label)
+            own = _get(entry, _FRAME_FIELDS, label)
             if isinstance(entry, list):
                 yield i, entry
-            elif isinstance(_get(entry, _PERSONS), list):
-                yield i if own is None else own, _get(entry, _PERSONS)
+            elif isinstance(_get(entry, _PERSON_FIELDS), list):
+                yield i if own is None else own, _get(entry, _PERSON_FIELDS)
             else:
                 yield own, [entry]
 
 
 def _frames_of_object(content: dict[str, Any], label: Any) -> Iterator[Labelled]:
     """Yields the frames in an object: one frame, frames by name, or frames of each person."""
-    persons = _get(content, _PERSONS)
+    persons = _get(content, _PERSON_FIELDS)
     if 'instance_info' in content:
         yield from frames_in(content['instance_info'], 0)
     elif isinstance(persons, list):
-        yield _get(content, _FRAME, label), persons
+        yield _get(content, _FRAME_FIELDS, label), persons
     elif label is not None:
         raise ValueError('an object without people, wanted what a detector writes for a frame')
     else:
         for name, value in content.items():
             if isinstance(value, list):
                 yield name, value
-            elif isinstance(_get(value, _PERSONS), list):
-                yield name, _get(value, _PERSONS)
+            elif isinstance(_get(value, _PERSON_FIELDS), list):
+                yield name, _get(value, _PERSON_FIELDS)
             elif isinstance(value, dict):
                 for frame, entry in value.items():
-                    if _get(entry, _POINTS) is not None:
+                    if _get(entry, _POINT_FIELDS) is not None:
                         yield frame, [{'track_id': name, **entry}]
 
 
@@ -161,10 +161,10 @@ def person_in(
     Raises:
         ValueError: the object is not a person.
     """
-    points = _get(entry, _POINTS)
+    points = _get(entry, _POINT_FIELDS)
     if points is None:
         raise ValueError(f'{where} has no image_id or no keypoints')
-    values = _triples(points, _get(entry, _SURE), where)
+    values = _triples(points, _get(entry, _CONFIDENCE_FIELDS), where)
     if names is not None and len(names) != len(values):
         raise ValueError(
             f'{where} has {len(values)} keypoints, but {len(names)} are named in categories'
@@ -175,10 +175,10 @@ def person_in(
     if names is None:
         orders_of(len(values))
         found.unnamed = len(values)
-    track, box = _get(entry, _TRACK), _get(entry, ('bbox',))
+    track, box = _get(entry, _TRACK_FIELDS), _get(entry, ('bbox',))
     track = track[0] if isinstance(track, list) and track else track
     track = int(track) if isinstance(track, float) and track.is_integer() else track
-    told = _get(entry, _SCORE, box[4] if isinstance(box, list) and len(box) > 4 else None)
+    told = _get(entry, _SCORE_FIELDS, box[4] if isinstance(box, list) and len(box) > 4 else None)
     told = told[0] if isinstance(told, list) and told else told
     return person(
         names,

@@ -13,19 +13,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hmt_ros.app.command_line import LARGEST
+from hmt_ros.app.command_line import MAX_IMAGE_SIDE
 from hmt_ros.app.import_video.frames import Frame, FrameSource
 from hmt_ros.image.keypoint_schemes import landmark_called, schemes, unnamed_orders
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
 
 _MATCHING_NS = 10_000_000  # maximum time difference between a row and its frame, ns
-MOST_FRAMES = 10_000_000
+MAX_FRAMES = 10_000_000
 # Minimum score of a person, as a fraction of the best score of the clip.
-_LIKELY = 0.2
-_SUREST = 1e9
+_MIN_SCORE_RATIO = 0.2
+_MAX_CONFIDENCE = 1e9
 _SIDES = {'l': 'left', 'r': 'right', 'left': 'left', 'right': 'right'}
-_SAME = {'mid_hip': 'hip', 'c_hip': 'hip', 'head_top': 'head', 'upper_neck': 'neck'}
+_SYNONYMS = {'mid_hip': 'hip', 'c_hip': 'hip', 'head_top': 'head', 'upper_neck': 'neck'}
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ def person(
     if names is None:
         names = schemes()[orders_of(len(places))[0]].names
         places, sure = places[: len(names)], sure[: len(names)]
-    sure = np.clip(np.nan_to_num(sure, nan=0.0), 0.0, _SUREST)
+    sure = np.clip(np.nan_to_num(sure, nan=0.0), 0.0, _MAX_CONFIDENCE)
     unseen = ~np.isfinite(places).all(1) | (places == 0.0).all(1) | (sure == 0.0)
     if unseen.all():
         return None
@@ -126,7 +126,7 @@ def orders_of(count: int) -> tuple[str, ...]:
 
 def image_size_of(width: Any, height: Any) -> tuple[int, int] | None:
     """Width and height of the images according to a file, px; None if invalid."""
-    known = all(isinstance(side, int) and 0 < side <= LARGEST for side in (width, height))
+    known = all(isinstance(side, int) and 0 < side <= MAX_IMAGE_SIDE for side in (width, height))
     return (width, height) if known else None
 
 
@@ -139,7 +139,7 @@ def landmark_name(name: str) -> str:
     if words and len(words[0]) > 1 and words[0][0] in 'lr' and words[0] not in _SIDES:
         words = [words[0][0], words[0][1:], *words[1:]]
     tried = '_'.join([_SIDES.get(x, x) for x in words[:1]] + words[1:])
-    tried = _SAME.get(tried, tried)
+    tried = _SYNONYMS.get(tried, tried)
     known = landmark_called(name) is None and landmark_called(tried) is not None
     return tried if known else name
 
@@ -172,8 +172,8 @@ class FoundPersons:
         Raises:
             ValueError: the number of the frame is too large.
         """
-        if not self.timed and key >= MOST_FRAMES:
-            raise ValueError(f'frame {key}, wanted at most {MOST_FRAMES} frames')
+        if not self.timed and key >= MAX_FRAMES:
+            raise ValueError(f'frame {key}, wanted at most {MAX_FRAMES} frames')
         self.frames[key] += [] if seen is None else [seen]
 
     @cached_property
@@ -207,7 +207,7 @@ class FoundPersons:
         """Persons with a sufficient score, by frame in increasing order."""
         best = max((x.score for x in self.persons()), default=0.0)
         return {
-            key: [x for x in found if x.score >= _LIKELY * best or best <= 0.0]
+            key: [x for x in found if x.score >= _MIN_SCORE_RATIO * best or best <= 0.0]
             for key, found in sorted(self.frames.items())
         }
 

@@ -13,17 +13,17 @@ from hmt_ros.app.import_video.keypoint_files.arrays import read_arrays
 from hmt_ros.app.import_video.keypoint_files.choice import Choice, chosen_person
 from hmt_ros.app.import_video.keypoint_files.clip_check import check_clip, check_steps
 from hmt_ros.app.import_video.keypoint_files.folders import read_folder
-from hmt_ros.app.import_video.keypoint_files.json_layouts import LARGEST_FILE, add_json
+from hmt_ros.app.import_video.keypoint_files.json_layouts import MAX_FILE_BYTES, add_json
 from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons
 from hmt_ros.app.import_video.keypoint_files.tables import read_table
-from hmt_ros.app.progress import Tell
+from hmt_ros.app.progress import Notify
 from hmt_ros.body.skeleton import other_side
 from hmt_ros.image.keypoint_schemes import AUTO
 from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools.files.error_line import error_line
 from msg_tools.files.plain_json import read_plain_json
 
-_FARTHEST = 1e5  # maximum coordinate of a keypoint, px
+_MAX_COORDINATE = 1e5  # maximum coordinate of a keypoint, px
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def read_keypoints(path: Path, source: FrameSource, first_stamp_ns: int) -> Foun
             raise ValueError('no such file')
         elif kind == '.json':
             found = FoundPersons(path)
-            add_json(found, read_plain_json(path, LARGEST_FILE), source)
+            add_json(found, read_plain_json(path, MAX_FILE_BYTES), source)
         elif kind == '.npz':
             found = read_arrays(path)
         elif kind in ('.csv', '.trc'):
@@ -71,7 +71,7 @@ def read_keypoints(path: Path, source: FrameSource, first_stamp_ns: int) -> Foun
                 '.json, .npz, .csv or .trc, or a folder with a file for each frame'
             )
         farthest = max((float(np.nanmax(np.abs(x.box))) for x in found.persons()), default=0.0)
-        if farthest > _FARTHEST:
+        if farthest > _MAX_COORDINATE:
             raise ValueError(f'a keypoint lies {farthest:g} px away, wanted positions in an image')
         for names in {x.keypoints.names for x in found.persons()}:
             if len({*names}) < len(names):
@@ -86,7 +86,7 @@ def keypoints_of_person(
     found: FoundPersons,
     reading: ClipReading,
     size: tuple[int, int],
-    tell: Tell,
+    notify: Notify,
     first: int = 0,
     rate: float | None = None,
 ) -> dict[int, Keypoints]:
@@ -100,15 +100,15 @@ def keypoints_of_person(
     Raises:
         ValueError: the clip is contradictory, or has no such person; the text names a remedy.
     """
-    told: list[str] = []
-    check_clip(found, size, told.append, scheme=reading.scheme, points_size=reading.points_size)
+    notices: list[str] = []
+    check_clip(found, size, notices.append, scheme=reading.scheme, points_size=reading.points_size)
     try:
         chosen = chosen_person(found, reading.person, first, rate)
         check_steps([chosen[key] for key in sorted(chosen)])
     except ValueError as error:
         raise ValueError(f'{found.path}: {error_line(error)}') from error
-    for text in told:
-        tell(text)
+    for text in notices:
+        notify(text)
     return {
         key: mirrored(one.keypoints, size[0]) if reading.mirror else one.keypoints
         for key, one in chosen.items()

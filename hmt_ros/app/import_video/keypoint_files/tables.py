@@ -17,16 +17,16 @@ from hmt_ros.image.keypoint_schemes import landmark_called
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.files.budget import Budget
 from msg_tools.files.error_line import error_line
-from msg_tools.files.plain_json import LARGEST
+from msg_tools.files.plain_json import MAX_MEMORY_BYTES
 from msg_tools.messages.headers import SECOND_NS
 
-LARGEST_FILE = 2**26  # maximum size, bytes
-_CELL = 64  # memory of a cell, bytes
-FRAME, TIME, STAMP = 'frame', 'time_s', 'stamp_ns'
+MAX_FILE_BYTES = 2**26  # maximum size, bytes
+_CELL_BYTES = 64  # memory of a cell, bytes
+FRAME_COLUMN, TIME_COLUMN, STAMP_COLUMN = 'frame', 'time_s', 'stamp_ns'
 # Minimum of Unix times, and maximum of times that are in seconds.
-_UNIX, _LATEST = 1e8, 1e11  # s
+_MIN_UNIX_TIME, _MAX_TIME = 1e8, 1e11  # s
 # Maximum coordinate of positions that are in metres, as from a calibrated system.
-_METRES = 20.0
+_MAX_METRES = 20.0
 
 # A cell: line number, frame or time, person, keypoint, and texts of column, row and confidence.
 Cells = tuple[int, str, str, str, tuple[str, str, str]]
@@ -42,15 +42,17 @@ def read_table(path: Path, source: FrameSource, first_stamp_ns: int) -> FoundPer
         ValueError: the file is not a known table, or is contradictory.
     """
     try:
-        text = read_bytes(path, LARGEST_FILE).decode('utf-8-sig')
+        text = read_bytes(path, MAX_FILE_BYTES).decode('utf-8-sig')
     except UnicodeDecodeError as error:
         raise ValueError('not a table: the file is not text in UTF-8') from error
     markers, budget = path.suffix.lower() == '.trc', Budget(len(text))
     separator = '\t' if markers else ','
     # Memory in Python of the text, of each cell with its entry in a list, and of each line.
-    needed = 2 * len(text) + _CELL * (text.count(separator) + 2 * text.count('\n'))
-    if needed > LARGEST:
-        raise ValueError(f'a table whose cells take {needed} bytes, wanted at most {LARGEST}')
+    needed = 2 * len(text) + _CELL_BYTES * (text.count(separator) + 2 * text.count('\n'))
+    if needed > MAX_MEMORY_BYTES:
+        raise ValueError(
+            f'a table whose cells take {needed} bytes, wanted at most {MAX_MEMORY_BYTES}'
+        )
     lines = csv.reader(io.StringIO(text), strict=not markers, delimiter=separator)
     rows: dict[tuple[str, str], dict[str, tuple[float, float, float]]] = defaultdict(dict)
     try:
@@ -58,11 +60,13 @@ def read_table(path: Path, source: FrameSource, first_stamp_ns: int) -> FoundPer
     except csv.Error as error:
         raise ValueError(f'line {lines.line_num}: {error}') from error
     if markers:
-        when, cells = TIME, _of_markers(table)
+        when, cells = TIME_COLUMN, _of_markers(table)
     elif any(x[:1] == ['coords'] for x in table[:4]):
-        when, cells = FRAME, _of_deeplabcut(table, budget)
+        when, cells = FRAME_COLUMN, _of_deeplabcut(table, budget)
     else:
-        when = next((x for x in (FRAME, TIME, STAMP) if table and x in table[0]), '')
+        when = next(
+            (x for x in (FRAME_COLUMN, TIME_COLUMN, STAMP_COLUMN) if table and x in table[0]), ''
+        )
         cells = _of_rows(table, when, budget)
     for number, label, who, name, (u, v, sure) in cells:
         about = rows[label, who]
@@ -72,7 +76,7 @@ def read_table(path: Path, source: FrameSource, first_stamp_ns: int) -> FoundPer
                 'persons apart'
             )
         about[name] = _number(u, number), _number(v, number), _number(sure, number)
-    found = FoundPersons(path, timed=when != FRAME)
+    found = FoundPersons(path, timed=when != FRAME_COLUMN)
     keys = _keys([label for label, _ in rows], when, source, first_stamp_ns)
     for key, ((_, who), keypoints) in zip(keys, rows.items(), strict=True):
         values = np.array([*keypoints.values()])
@@ -142,7 +146,7 @@ def _of_markers(table: list[list[str]]) -> Iterator[Cells]:
         raise ValueError('rows of markers have another length than the header')
     points = np.array(numbers).reshape(-1, 3)
     farthest = np.nanmax(np.abs(points), axis=0, initial=0.0)
-    if farthest[2] > 0 or farthest[:2].max() <= _METRES:
+    if farthest[2] > 0 or farthest[:2].max() <= _MAX_METRES:
         raise ValueError(
             'the markers have three coordinates or metres; wanted image positions: the file of '
             'Sports2D with _px_ in its name'
@@ -167,21 +171,23 @@ def _landmarks(parts: Sequence[str]) -> dict[str, str]:
 
 def _keys(labels: Sequence[str], when: str, source: FrameSource, first_stamp_ns: int) -> list[int]:
     """Frame keys from a column of labels; Unix times become relative to the first time."""
-    if when == FRAME:
+    if when == FRAME_COLUMN:
         return [source.number_of(x) for x in labels]
     try:
-        times = [int(x) if when == STAMP else round(float(x) * SECOND_NS) for x in labels]
+        times = [int(x) if when == STAMP_COLUMN else round(float(x) * SECOND_NS) for x in labels]
     except (ValueError, OverflowError) as error:
         raise ValueError(f'{when} has {error_line(error)[:60]}, wanted numbers') from error
     first, unit = min(times, default=0), 1
-    while when == TIME and first / unit > _LATEST * SECOND_NS:
+    while when == TIME_COLUMN and first / unit > _MAX_TIME * SECOND_NS:
         unit *= 1000  # milliseconds or shorter units
-    if when == STAMP:
+    if when == STAMP_COLUMN:
         first = first_stamp_ns
-    elif first / unit < _UNIX * SECOND_NS:
+    elif first / unit < _MIN_UNIX_TIME * SECOND_NS:
         first = 0
     keys = [(x - first) // unit for x in times]
-    if keys and (max(keys) - min(keys) > _UNIX * SECOND_NS or max(keys) + first_stamp_ns > 2**62):
+    if keys and (
+        max(keys) - min(keys) > _MIN_UNIX_TIME * SECOND_NS or max(keys) + first_stamp_ns > 2**62
+    ):
         raise ValueError(f'{when} has times that are years apart, wanted those of one recording')
     return keys
 
