@@ -4,8 +4,8 @@ import os
 
 __version__ = '1.0.0'
 
-# OpenCV reads these when it is loaded. They limit the pixels of an image in any format, and disable
-# log lines about unusable files, which our own errors report.
+# OpenCV reads these variables when it is loaded. They limit the number of pixels of an image, and
+# disable log lines about unusable files, which the package reports itself.
 for _name, _value in (
     ('OPENCV_IO_MAX_IMAGE_PIXELS', str(2**26)),
     ('OPENCV_LOG_LEVEL', 'SILENT'),

@@ -254,7 +254,7 @@ def tracked(name, folder):
         with_smoother=False,
         quiet=True,
     )
-    replay_bag(source, target, options, tell=print)
+    replay_bag(source, target, options, notify=print)
     return target
 
 

@@ -209,7 +209,7 @@ def digests_of(clip, name, count, **options):
                 break
             new.write(stored.topic, stored.log_time_ns, stored.message)
     result = folder / f'{clip}_result'
-    replay_bag(short, result, ReplayOptions(quiet=True, **options), tell=lambda *_: None)
+    replay_bag(short, result, ReplayOptions(quiet=True, **options), notify=lambda *_: None)
     digests = {}
     with BagReader(result) as bag:
         for stored in bag.messages():

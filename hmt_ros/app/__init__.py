@@ -1,4 +1,4 @@
-"""The commands: `python -m hmt_ros <command>`, or a separate executable for each."""
+"""The commands: `python -m hmt_ros <command>`, or one executable per command."""
 
 from __future__ import annotations
 
@@ -39,5 +39,5 @@ and bme_node. In a checkout python -m hmt_learning has the commands that render 
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs a command; returns 0 when done, 1 for bad input (one line on stderr explains it)."""
+    """Runs a command; returns 0 on success, 1 for bad input (explained in one line on stderr)."""
     return run_program('hmt_ros', COMMANDS, DESCRIPTION, FURTHER_HELP, argv)

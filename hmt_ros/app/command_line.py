@@ -1,4 +1,4 @@
-"""Common parts of all commands: reading of arguments, error lines and exit codes."""
+"""Common parts of all commands: argument parsing, error messages and exit codes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Number = TypeVar('Number', int, float)
 
 
 class CommandParser(argparse.ArgumentParser):
-    """An argument parser that treats a bad argument as bad input: one line and exit code 1."""
+    """An argument parser that reports a bad argument in one line, with exit code 1."""
 
     def __init__(self, prog: str, description: str = '', epilog: str = '') -> None:
         super().__init__(
@@ -131,12 +131,13 @@ def run_program(
 
     Args:
         program: name of the package.
-        commands: module and description by name; a module is imported when its command runs.
+        commands: module and description by command name; a module is imported when its command
+            runs.
         about, more: texts of the help, before and after the commands.
-        argv: name and arguments of the command; None selects those of the process.
+        argv: name and arguments of the command; None selects the arguments of the process.
 
     Returns:
-        The exit code: 0 when done, 1 for bad input (one line on stderr explains it).
+        The exit code: 0 on success, 1 for bad input (explained in one line on stderr).
     """
     words = list(sys.argv[1:] if argv is None else argv)
 
@@ -171,8 +172,9 @@ def run_command(
     Args:
         parser: argument parser of the command; `prog` is the name of the command.
         work: function of the command; it raises ValueError or OSError on bad input.
-        argv: arguments of the command; None selects those of the process.
-        whole_or_nothing: whether an interrupted command writes nothing, which is then reported.
+        argv: arguments of the command; None selects the arguments of the process.
+        whole_or_nothing: whether an interrupted command writes nothing, so that the error message
+            can say so.
 
     Returns:
         The exit code of `work`, or of `last_resort` after an exception.
@@ -191,7 +193,7 @@ def run_command(
 def number(
     low: float, high: float, *, what: str = 'a number', unit: str = ''
 ) -> Callable[[str], float]:
-    """Returns a parser for numbers in a range; its errors name the range and the unit."""
+    """Returns a parser for numbers in a range; error messages name the range and the unit."""
     return _reader(float, low, high, f'{what} from {low:g} to {high:g}{unit}')
 
 

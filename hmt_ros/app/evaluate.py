@@ -58,7 +58,7 @@ examples:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; returns 0 when done, 1 for bad input (one line on stderr explains it)."""
+    """Runs the command; returns 0 on success, 1 for bad input (explained in one line on stderr)."""
     return run_command(_parser(), _evaluate, argv)
 
 
@@ -143,7 +143,7 @@ def as_json(
 
 
 def _finite(value: Any) -> Any:
-    """Replaces infinity and NaN, which JSON does not have, by None."""
+    """Replaces infinity and NaN, which JSON can not represent, by None."""
     if isinstance(value, dict):
         return {key: _finite(each) for key, each in value.items()}
     if isinstance(value, list):
@@ -244,8 +244,8 @@ def score_bag(
     Args:
         topics: names of the topics to score; empty selects all topics with mixtures.
         model_sigma: see `hmt_ros.evaluation.pose_scores`, m.
-        body_model: name or file of the body model, if the name in the bag is unknown; None uses the
-            name in the bag.
+        body_model: name or file of the body model, which replaces the name in the bag; None uses
+            the name in the bag.
 
     Raises:
         ValueError: no mixtures, invalid messages, or no frame with ground truth.
@@ -265,7 +265,7 @@ def score_bag(
 
 
 def score_gravity(path: Path, truth: Truth) -> dict[str, GravityScores]:
-    """Computes scores of the estimated vertical by topic, if the true vertical is known.
+    """Computes the scores of the estimated vertical for each topic, if the true vertical is known.
 
     Raises:
         ValueError: invalid messages.
@@ -287,7 +287,7 @@ def chosen_topics(bag: BagReader, wanted: Iterable[str]) -> list[str]:
     """Names of the wanted topics with mixtures; by default all in the bag except ground truth.
 
     Raises:
-        ValueError: no topic has mixtures, or a wanted topic has none.
+        ValueError: no topic has mixtures, or a wanted topic has no mixtures.
     """
     poses = [x.name for x in bag.topics_of(POSE_MIXTURE) if not is_truth(bag, x.name)]
     trajectories = [x.name for x in bag.topics_of(TRAJECTORY_MIXTURE)]

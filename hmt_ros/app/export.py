@@ -39,7 +39,7 @@ FORMATS = ('.bvh', '.csv', '.npz')
 RADIUS_90 = 2.5003
 # Minimum length of a gap between poses, in median intervals.
 _GAP_RATIO = 1.5
-# Maximum rotation of the vertical for a static camera, degrees.
+# Rotation of the vertical above which the camera is not static, degrees.
 _MAX_CAMERA_TURN = 5.0
 
 EPILOG = """\
@@ -86,9 +86,9 @@ class TrackedMotion:
     Attributes:
         topic: topic of the mixtures.
         steps: (T,) poses in the order of their stamps.
-        of: the last mixture, used for fields that are equal in all mixtures.
+        of: the last mixture; its fields that are equal in all mixtures are used.
         body: body with the segment lengths of the last mixture; None if unknown.
-        room: (3, 3) rotation from the frame of the mixtures to axes with y up.
+        room: (3, 3) rotation from the frame of the mixtures to a frame with y up.
         height: height of the camera above the floor, m; 0 if unknown.
         notes: lines of text for the user.
     """
@@ -127,7 +127,7 @@ class TrackedMotion:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; returns 0 when done, 1 for bad input (one line on stderr explains it)."""
+    """Runs the command; returns 0 on success, 1 for bad input (explained in one line on stderr)."""
     return run_command(_parser(), _export, argv, whole_or_nothing=True)
 
 
@@ -207,7 +207,7 @@ def motion_bytes(motion: TrackedMotion, kind: str, rate: float | None = None) ->
         rate: poses per second of a .bvh; None selects the median rate of the motion.
 
     Raises:
-        ValueError: a .bvh is wanted and the body is unknown, or there are too many poses.
+        ValueError: the body is unknown, which a .bvh needs, or there are too many poses.
     """
     if kind == '.csv':
         return _table(motion).encode('utf-8')
@@ -220,7 +220,7 @@ def motion_bytes(motion: TrackedMotion, kind: str, rate: float | None = None) ->
 
 
 def _table(motion: TrackedMotion) -> str:
-    """Text of a .csv with one row per time; radii are left out if covariances are unknown."""
+    """Text of a .csv file, one row per time; radii are left out if covariances are unknown."""
     covariances = _all([step.joint_covariances for step in motion.steps])
     columns = ['x', 'y', 'z']
     numbers = np.array([step.joints for step in motion.steps])
@@ -240,7 +240,7 @@ def _table(motion: TrackedMotion) -> str:
 
 
 def _arrays(motion: TrackedMotion) -> dict[str, Any]:
-    """Arrays of a .npz by name; covariances are left out if unknown."""
+    """Arrays for a .npz file by name; covariances are left out if unknown."""
     steps, of = motion.steps, motion.of
     names = list(of.segment_lengths)
     result = {
@@ -267,7 +267,7 @@ def _arrays(motion: TrackedMotion) -> dict[str, Any]:
 
 
 def _all(values: Sequence[Array | None]) -> Array | None:
-    """The values as one array; None if any of them is unknown."""
+    """Stacks values into one array; None if a value is unknown."""
     return None if any(value is None for value in values) else np.array(values)
 
 
@@ -288,8 +288,8 @@ def read_tracked_motion(
             else predictions.
         identity: identity of the motion; None selects the heaviest mode at each time.
         track: number of the track; None selects the track with the most poses.
-        body_model: name or file of the body model, if the name in the bag is unknown.
-        camera_axes: whether to ignore a known gravity.
+        body_model: name or file of the body model, which replaces the name in the bag.
+        camera_axes: whether to keep the axes of the camera even if gravity is known.
 
     Raises:
         ValueError: no such topic, track or motion, or invalid messages.
@@ -352,7 +352,7 @@ def _topic(bag: BagReader, wanted: str | None) -> str:
 def _mixtures(
     bag: BagReader, name: str, bodies: RecordedBodies, progress: Callable[[int], object]
 ) -> Iterator[PoseMixture]:
-    """Yields the mixtures on a topic, which must all have the same variables."""
+    """Yields the mixtures on a topic, which must agree in degrees of freedom and joints."""
     names: dict[str, tuple[str, ...]] = {}
     for stored in bodies.messages(bag, [name], progress):
         content = stored.content(partial(pose_mixture_of, **names))
@@ -361,7 +361,7 @@ def _mixtures(
 
 
 def _pose(content: PoseMixture, identity: int | None) -> TrackedPose | None:
-    """The heaviest component, or the heaviest with a given identity; None if missing."""
+    """The heaviest component, optionally with a given identity; None if missing."""
     assert content.identities is not None
     weights = content.weights
     if identity is not None:
@@ -390,7 +390,7 @@ def _track(
     track: int | None,
     identity: int | None,
 ) -> int:
-    """Number of the wanted track, or else of the longest track."""
+    """Number of the wanted track, by default of the longest track."""
     if not motions:
         raise ValueError(f'{where}: nobody is seen in any mixture')
     if track is not None and track not in motions:
@@ -407,7 +407,7 @@ def _track(
 
 
 def _room(path: Path, topic: str, frame_id: str) -> tuple[Array, float, str]:
-    """Rotation to axes with y up, height of the camera, m (0 if unknown), and a description."""
+    """Rotation to a frame with y up, camera height, m (0 if unknown), and text about the frame."""
     grounds = read_grounds(path, topic, frame_id).values()
     if not grounds:
         told = f'in the axes of {frame_id}, turned to y up: its gravity is not known'

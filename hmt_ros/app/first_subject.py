@@ -20,7 +20,7 @@ from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.keypoints import keypoints_of
 
-# Joints that the first image of the track should show, and minimum number of them.
+# Joints that the first image of the track should show, and how many of them are enough.
 WANTED_JOINTS = tuple(
     f'{side}_{joint}'
     for joint in ('hip', 'shoulder', 'knee', 'ankle', 'elbow', 'wrist')
@@ -31,7 +31,8 @@ MIN_JOINTS = 4  # minimum number of joints in a subject file
 MIN_CONFIDENCE = 0.5
 # Name of the landmark at the joint of the head.
 _CENTRE_OF_HEAD = 'centre_of_head'
-# Standard deviation of a keypoint as a fraction of the person's image size, and its minimum, px.
+# Standard deviation of a keypoint as a fraction of the person's image size, and the minimum
+# standard deviation, px.
 SIGMA, MIN_SIGMA = 0.03, 2.0
 
 
@@ -92,7 +93,7 @@ def joints_of(keypoints: Keypoints, body: Body) -> Keypoints:
     """The joints of a body that have confident landmarks, under their names in the body.
 
     A joint is at the landmark of the same name. If the detector has no such landmark, the joint is
-    at the mean of its landmarks; for example, the hand is at the mean of the fingers.
+    at the mean of several landmarks, for example the hand at the mean of the fingers.
     """
     names, known = keypoints.names, body.joint_names
     sure = keypoints.seen & (keypoints.confidences >= MIN_CONFIDENCE)

@@ -29,11 +29,11 @@ def last_resort(
     """Runs a program; any exception becomes one line on stderr, at most `MAX_LINE` long.
 
     Args:
-        debug: whether to print the traceback of an error as well.
+        debug: whether to print the traceback of an error, too.
         lost: text after "interrupted" about the lost work.
 
     Returns:
-        The exit code: that of `run`; 1 after an error; `INTERRUPTED`; or `NOBODY_READS` if the
+        The exit code of `run`; 1 after an error; `INTERRUPTED`; or `NOBODY_READS` if the
         reader of stdout, for example head, has exited.
 
     Raises:

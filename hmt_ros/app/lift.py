@@ -58,7 +58,8 @@ from msg_tools.messages.headers import FRAME_ID, SECOND_NS, START_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
 LIFTED_FOLDER, REPORT_FOLDER = 'lifted', 'report'
-# Minimum component of gravity along the optical axis for a check with poses lifted without gravity.
+# Minimum component of gravity along the optical axis at which gravity is checked with poses lifted
+# without it.
 MIN_STEEP_COMPONENT = 0.8
 # Minimum leap, as the ratio of a distance to the local median; half width of the median's window,
 # s; fraction of images with leaps above which the user is warned.
@@ -87,7 +88,7 @@ exit code: 0 done, 1 bad input (one line on stderr explains it), 130 interrupted
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; returns 0 when done, 1 for bad input (one line on stderr explains it)."""
+    """Runs the command; returns 0 on success, 1 for bad input (explained in one line on stderr)."""
     return run_command(_parser(), _lift, argv)
 
 
@@ -232,7 +233,7 @@ def _in_frames(
 
 
 def _up(seen: Sequence[Keypoints], body: Body, arguments: argparse.Namespace) -> Array | None:
-    """Unit vector (3,) opposite to the given gravity, camera frame; None if it is not given.
+    """Unit vector (3,) opposite to the given gravity, camera frame; None if gravity is not given.
 
     A gravity that points to the head of the person is taken as the reading of an accelerometer: its
     sign is reversed, and the user is notified.
@@ -251,7 +252,7 @@ def _up(seen: Sequence[Keypoints], body: Body, arguments: argparse.Namespace) ->
 def _with_leaps(
     mixtures: Sequence[GaussianMixture | None], stamps: Sequence[int]
 ) -> list[GaussianMixture | None]:
-    """Widens mixtures along the line of sight in images in which the distance leaps.
+    """Widens mixtures along the line of sight where the estimated distance of the person leaps.
 
     If little of the person is in view, the estimated distance can change faster than a person can
     walk. The user is warned if many images have such leaps.

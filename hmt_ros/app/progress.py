@@ -1,7 +1,7 @@
 """Progress of a command on stderr: a tqdm bar on a terminal, else a line every few seconds.
 
-A thread prints both, so that the command shows activity during long steps. Only results are printed
-on stdout.
+A thread prints the bar or the lines, so that the command shows activity during long steps. Only
+results are printed on stdout.
 
     with show_progress(str(output), 'images', total=120) as bar:
         for image in images:
@@ -24,7 +24,7 @@ from msg_tools.files.error_line import MAX_LINE, one_line, printable
 
 Item = TypeVar('Item')
 Progress: TypeAlias = 'tqdm[Any]'
-Notify = Callable[[str], object]  # shows a line to the user
+Notify = Callable[[str], object]  # function that shows a line to the user
 
 INTERVAL = 3.0  # time between two lines, s; a bar shows the time every second
 
@@ -51,7 +51,7 @@ class _Bar(tqdm):
             Thread(target=self._show_time, name='progress', daemon=True).start()
 
     def __iter__(self) -> Iterator[Any]:
-        """Counts each item at once; tqdm counts only when it draws, which the thread does here."""
+        """Counts each item at once; tqdm counts only when it draws, but here a thread draws."""
         try:
             for item in self.iterable:
                 yield item
@@ -91,13 +91,13 @@ def with_progress(
     *,
     quiet: bool = False,
 ) -> tqdm[Item]:
-    """Yields the items and shows how many are finished; without items, call `update` to count."""
+    """Yields items and shows how many are finished; without items, the caller calls `update`."""
     options: dict[str, Any] = {'iterable': items, 'unit': f' {unit}', 'total': total}
     options['desc'] = one_line(what)
     if not unit:
         options['bar_format'] = '{desc}: {elapsed} so far'
     if quiet or _is_wide_terminal():
-        # A bar below another one is removed at its end.
+        # A bar below another bar is removed when it is complete.
         return _Bar(1.0, **options, disable=quiet, leave=None)
     # The thread prints all lines, the first one after the first interval.
     return _Bar(INTERVAL, **options, file=LineFile(), ncols=0, mininterval=math.inf, delay=math.inf)
@@ -115,7 +115,7 @@ def say(*texts: object, most: int = MAX_LINE) -> None:
 
 
 def _is_wide_terminal() -> bool:
-    """Whether stderr is a terminal with room for a bar; in containers it may have no columns."""
+    """Whether stderr is a terminal with room for a bar; a width of 0 occurs in containers."""
     try:
         return sys.stderr.isatty() and os.get_terminal_size(sys.stderr.fileno()).columns > 0
     except (OSError, ValueError):

@@ -1,7 +1,8 @@
 """The bodies of the mixtures in a bag, and the ground.
 
-A mixture with segment lengths defines its own body. A mixture of another publisher may lack them;
-its body is then from the Body topic in its namespace, or from the only Body topic of the bag.
+A mixture with segment lengths defines its own body. A mixture of another publisher may lack
+lengths; its body is then from the Body topic in the same namespace, or else from the only Body
+topic of the bag.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ BODY = 'hmt_msgs/msg/Body'
 
 
 def topic_beside(bag: BagReader, msgtype: str, topic: str) -> str | None:
-    """The topic of a type in the namespace of another topic, or else the only one in the bag."""
+    """Topic of a type in the namespace of a given topic, or else the only topic of this type."""
     names = [x.name for x in bag.topics_of(msgtype)]
     chosen = [name for name in names if _namespace(name) == _namespace(topic)] or names
     return chosen[0] if len(chosen) == 1 else None
@@ -32,8 +33,8 @@ class RecordedBodies:
     """The bodies of the mixtures in a bag.
 
     Args:
-        model: name or file of the body model, if the name in the bag is unknown; None uses the name
-            in the bag.
+        model: name or file of the body model, which replaces the name in the bag; None uses the
+            name in the bag.
     """
 
     def __init__(self, model: str | None) -> None:
@@ -74,7 +75,7 @@ class RecordedBodies:
         self._described[_namespace(stored.topic)] = body
 
     def of(self, topic: str, content: PoseMixture | TrajectoryMixture) -> Body | None:
-        """The body of a mixture on a topic, None if unknown; the same object until it changes."""
+        """Body of a mixture on a topic, None if unknown; the same object until the body changes."""
         if not content.segment_lengths:
             body = self._described.get(_namespace(topic))
             if body is None and len(self._described) == 1:
@@ -91,7 +92,7 @@ class RecordedBodies:
         return self._newest[topic][1]
 
     def _model_of(self, name: str) -> Body:
-        """The model of the user, or else the shipped model; bags never name files."""
+        """The user's model, or else the shipped model; names in bags are never file names."""
         return named_body(name) if self._model is None else load_body(self._model)
 
 
@@ -100,8 +101,8 @@ def read_grounds(path: Path, topic: str, frame_id: str) -> dict[int, GroundState
 
     Args:
         topic: topic of the mixtures; the topic of the ground is in the same namespace, or else the
-            only one of its type in the bag.
-        frame_id: frame of the mixtures; a ground in another frame is left out.
+            bag's only ground topic.
+        frame_id: frame of the mixtures; a ground in a different frame is left out.
 
     Raises:
         ValueError: an invalid message.

@@ -4,8 +4,9 @@ track-video walk.mp4
 track-video street.mp4 --people 3
 
 Missing arguments get defaults: an installed detector finds the keypoints; the field of view is from
-the metadata of the video, or else that of common cameras, and its uncertainty is included in all
-depths; lines in the scene give gravity; a folder of images gets the frame rate of a usual video.
+the metadata of the video, or else typical of cameras; gravity is estimated from lines in the scene;
+a folder of images gets a usual frame rate. The uncertainty of the field of view is included in all
+depths.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ exit code: 0 done, 1 bad input (one line on stderr explains it), 130 interrupted
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; returns 0 when done, 1 for bad input (one line on stderr explains it)."""
+    """Runs the command; returns 0 on success, 1 for bad input (explained in one line on stderr)."""
     return run_command(_parser(), _track, argv)
 
 
@@ -205,6 +206,6 @@ def _assumed(arguments: argparse.Namespace) -> tuple[list[str], list[str]]:
 
 
 def _of_gravity(arguments: argparse.Namespace) -> list[str]:
-    """Tracker settings with the direction of gravity; empty if it is not given."""
+    """Tracker settings with the direction of gravity; empty if gravity is not given."""
     gravity = gravity_of(arguments)
     return [] if gravity is None else [f'gravity={gravity}']

@@ -33,7 +33,7 @@ def read_truth(path: Path) -> Truth:
     x y z w.
 
     Raises:
-        ValueError: another kind of file, or arrays that are missing or contradictory.
+        ValueError: unsupported kind of file, or missing or inconsistent arrays.
     """
     if path.suffix == '.npz':
         return _from_arrays(path)
@@ -101,7 +101,7 @@ def _ground(path: Path, content: Mapping[str, Array], stamps: Array) -> dict[int
         lengths = np.linalg.norm(known['gravity'], axis=1)
     if not ((lengths > 0) & np.isfinite(lengths) & np.isfinite(known['camera_height'])).all():
         raise ValueError(f'{path}: gravity or camera_height is zero or not finite somewhere')
-    # A camera whose pose is not given is at rest.
+    # A camera without a given pose is assumed to be at rest.
     moves = {'camera_position', 'camera_quaternion'} <= known.keys()
     return {
         int(stamp): TrueGround(

@@ -1,4 +1,4 @@
-"""The person: skeleton, kinematics, flesh, limits, priors, and the camera that looks."""
+"""Model of a person (skeleton, kinematics, flesh, limits, priors) and of the camera."""
 
 from __future__ import annotations
 

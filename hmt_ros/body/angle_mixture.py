@@ -3,7 +3,7 @@
     p(a) = w_0 N(a; m_0, S_0) + sum_k w_k/2 [N(a; m_k, S_k) + N(Ra; m_k, S_k)]
 
 a are the angles of a pose, Ra their left-right mirror image. Component 0 is broad: it bounds the
-energy of poses that are unlike the training data.
+energy of poses unlike the training data.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from hmt_ros.inference.mixture import GaussianMixture
 
 KIND = 'pose_prior'
 MAX_COMPONENTS = 1000
-# Maximum number of steps of the ascent to the highest density; step size at which it ends, rad.
+# Maximum number of ascent steps to the mode; step size at which the ascent ends, rad.
 MAX_ASCENT_STEPS, ASCENT_TOLERANCE = 1000, 1e-7
 ROTATION_TOLERANCE = 1e-4  # maximum difference between equal rest rotations in single precision
 
@@ -44,15 +44,15 @@ class AngleMixture:
     """A mixture over some of the angles of a body, symmetric under left-right mirroring.
 
     Attributes:
-        skeleton: skeleton of the angles; its lengths are not used.
+        skeleton: skeleton that the angles belong to; its lengths are not used.
         dofs: names of the n degrees of freedom that the mixture covers.
-        components: broad component first, then K components, each with the total weight of the
-            component and its mirror image.
+        components: the broad component, then K components. Each of the K weights is shared with the
+            mirror image of the component.
         card: training data, method and licence, serialisable as JSON.
 
     Raises:
-        ValueError: the body lacks a name, the mirror image of a name is missing, or the components
-            are invalid; one line.
+        ValueError: the skeleton lacks an angle, `dofs` lacks the mirror image of an angle, or the
+            components are invalid; one-line message.
     """
 
     skeleton: Skeleton
@@ -107,7 +107,7 @@ class AngleMixture:
 
     @cached_property
     def highest(self) -> float:
-        """The largest log density."""
+        """Maximum of the log density over all angles."""
         whole, n = self.whole, self.whole.dimension
         precisions = self.precisions.reshape(len(whole), n * n)
         pulled = product(self.precisions, whole.means[..., None])[..., 0]
@@ -125,11 +125,11 @@ class AngleMixture:
         return float(whole.log_density(points).max())
 
     def log_density(self, poses: Array) -> Array:
-        """log p (N,) of the angles of poses (N, d), rad^-n."""
+        """Log density (N,) of the angles of poses (N, d); the density is in rad^-n."""
         return self.whole.log_density(poses[:, self.indices])
 
     def to_arrays(self) -> Arrays:
-        """The arrays of a file; numbers in single precision."""
+        """Arrays for a file, with numbers in single precision."""
         own, lower = self.components, np.tril_indices(len(self.dofs))
         parameters = {'body': self.skeleton.name, 'dofs': list(self.dofs)}
         return header(KIND, parameters) | {
@@ -141,11 +141,11 @@ class AngleMixture:
 
     @classmethod
     def from_arrays(cls, arrays: Arrays, skeleton: Skeleton) -> AngleMixture:
-        """The mixture that `to_arrays` and a card describe, of the angles of a skeleton.
+        """Build the mixture over angles of a skeleton from the arrays of a file.
 
         Raises:
-            ValueError, LookupError, TypeError: arrays or parameters are missing or wrong, or the
-                skeleton differs.
+            ValueError, LookupError, TypeError: arrays or parameters are missing or invalid, or they
+                belong to a different skeleton.
         """
         parameters, card = parameters_of(arrays), parameters_of(arrays, 'card')
         same = np.allclose(arrays['mounts'], skeleton.mounts, atol=ROTATION_TOLERANCE)
@@ -160,7 +160,7 @@ class AngleMixture:
         return cls(skeleton, dofs, components, card)
 
     def answer(self, given: Array) -> GaussianMixture:
-        """The mixture, for any input."""
+        """Return the same mixture for every input."""
         return self.whole
 
     @cached_property
@@ -175,7 +175,7 @@ class AngleMixture:
 
 
 def shipped_prior(body: Body) -> AngleMixture | None:
-    """Return the shipped learned prior for a body, or None if none matches its angles."""
+    """Return the shipped learned prior for a body, or None if no prior matches the angles."""
     mixture = _shipped(body.name)
     return (
         mixture if mixture is not None and _same_angles(mixture.skeleton, body.skeleton) else None
@@ -193,7 +193,7 @@ def _same_angles(first: Skeleton, second: Skeleton) -> bool:
         first.dof_names == second.dof_names
         and np.array_equal(first.dof_axes, second.dof_axes)
         and first.mounts.shape == second.mounts.shape
-        # The root may have another level.
+        # Skip the root, because its level may differ.
         and np.allclose(first.mounts[1:], second.mounts[1:], atol=ROTATION_TOLERANCE)
     )
 
@@ -203,6 +203,7 @@ def read_pose_prior(path: str | Path, body: Body) -> AngleMixture:
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged, has another format, or is for another body; one line.
+        ValueError: the file is damaged, has the wrong format, or is for a different body; one-line
+            message.
     """
     return read_model(path, KIND, partial(AngleMixture.from_arrays, skeleton=body.skeleton))

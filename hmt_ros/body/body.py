@@ -32,7 +32,7 @@ from hmt_ros.inference.logistic import probability_of
 # factors on the x and y radii, additional extent beyond the start and the end of its segment, m,
 # and shift along the y axis, m.
 GROWTH_COLUMNS = ('width', 'depth', 'start', 'end', 'shift')
-# Angles of a root that can be levelled.
+# Angles of the root in bodies that `levelled` supports.
 ROOT_ANGLES = ('root_z', 'root_y', 'root_x')
 # Minimum half height of a part, m.
 MIN_HEIGHT = 5e-3
@@ -45,8 +45,8 @@ class PartShape:
     Attributes:
         segment: index of the segment that carries the part.
         length: index of the length that the part spans; None for a part of fixed proportions.
-        centre: centre of the part in its segment's frame, m; if the part spans a length, its shift
-            from the middle of that length.
+        centre: centre of the part in its segment's frame, m; if the part spans a length, the shift
+            of the centre from the middle of that length.
         radii: semi-axes (x, y) if the part spans a length, else (x, y, z), m.
         exponents, taper, bend: shape parameters, as in `Superquadric`.
         extend: distances by which the part exceeds the start and the end of the length, m.
@@ -95,7 +95,7 @@ class Body:
     """Model of a person: the meaning of a pose vector, and the shape of the flesh.
 
     Poses have shape (N, d): root translation in the camera optical frame (m), root rotation, joint
-    angles (rad). Made by `load_body`.
+    angles (rad). Use `load_body` to make a body.
 
     Attributes:
         skeleton: segments, degrees of freedom, joints and lengths.
@@ -109,10 +109,10 @@ class Body:
         stature_lengths, stature_extra: the stature is the sum of these lengths plus the extra, m,
             which scales with the lengths.
         default_lengths: (L,) lengths of the model file, m.
-        symmetries: symmetries by map; see `Symmetry`.
+        symmetries: the symmetry for each map in `MAPS`.
         joint_errors: (J,) standard deviation of the constant error of each joint's coordinates
             relative to the pelvis, m, because people's joints differ from the model's.
-        growth: (B, 5) difference of each part from the model's; see `GROWTH_COLUMNS`.
+        growth: (B, 5) difference of each part from the model file; see `GROWTH_COLUMNS`.
         level: (3, 3) rotation from the reference axes of the root's angles to the axes of the
             camera; see `levelled`.
     """
@@ -232,11 +232,11 @@ class Body:
 
     @cached_property
     def scale(self) -> float:
-        """Ratio of the size of the body to that of its model file."""
+        """Size of the body relative to its model file."""
         return self._sum_of(self.skeleton.lengths) / self._sum_of(self.default_lengths)
 
     def scale_of(self, shape: PartShape) -> float:
-        """Ratio of the size of one part to that in the model file, apart from its growth."""
+        """Size of one part relative to the model file, without its growth."""
         if shape.size is None:
             return self.scale
         return float(self.skeleton.lengths[shape.size] / self.default_lengths[shape.size])
@@ -273,7 +273,7 @@ class Body:
         return kinematics.point_jacobians(frames, segments, points)
 
     def with_segment_lengths(self, lengths: Mapping[str, float]) -> Body:
-        """Return the same body with other values (m) of some lengths.
+        """Return a copy of the body with new values (m) of some lengths.
 
         Raises:
             KeyError: the body has no length of this name.
@@ -282,7 +282,7 @@ class Body:
         return replace(self, skeleton=self.skeleton.with_lengths(lengths))
 
     def with_stature(self, stature: float) -> Body:
-        """Return the same body with all lengths and their spread scaled to a stature, m.
+        """Return a copy of the body with all lengths and their spread scaled to a stature, m.
 
         Raises:
             ValueError: the stature is not a positive number.
@@ -295,7 +295,7 @@ class Body:
         return replace(self, skeleton=skeleton, length_covariance=covariance)
 
     def with_growth(self, growth: ArrayLike) -> Body:
-        """Return the same body with another growth (B, 5) of the parts; see `GROWTH_COLUMNS`.
+        """Return a copy of the body with a new growth (B, 5) of the parts; see `GROWTH_COLUMNS`.
 
         Raises:
             ValueError: the shape is wrong, or a number is not finite.
@@ -305,7 +305,7 @@ class Body:
     def with_beliefs(
         self, *, prior_sigma: Array | None = None, joint_errors: Array | None = None
     ) -> Body:
-        """Return the same body with another prior or other joint errors; the flesh is kept."""
+        """Return a copy of the body with a new prior or new joint errors, and the same flesh."""
         result = replace(
             self,
             prior_sigma=self.prior_sigma if prior_sigma is None else prior_sigma,
@@ -315,11 +315,11 @@ class Body:
         return result
 
     def levelled(self, level: Array) -> Body:
-        """Return the same body with the root angles measured in the axes of an upright camera.
+        """Return a copy of the body with root angles measured in the axes of an upright camera.
 
-        The root angles of an upright person are then far from their poles and limits at every
-        orientation of the camera. Translations stay in the axes of the camera. A body whose root
-        has other angles is returned unchanged.
+        The root angles of an upright person are then far from singularities and limits, however the
+        camera is oriented. Translations stay in the axes of the camera. A body that lacks
+        `ROOT_ANGLES` is returned unchanged.
 
         Args:
             level: (3, 3) rotation from the axes of an upright camera to the camera's axes.
@@ -348,7 +348,7 @@ MAPS: Mapping[str, str] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Symmetry:
-    """A symmetry of a body.
+    """Two-state chain of a pose and its mapped pose, which has nearly the same image.
 
     Attributes:
         rate: Rate of switching to the mapped pose, 1/s.
@@ -369,14 +369,14 @@ class Symmetry:
         return -float(elementary.log(self.probability(dt))) if dt > 0.0 else math.inf
 
     def after(self, log_odds: float, dt: float) -> float:
-        """Log odds of the mapped pose after dt seconds, from present log odds."""
+        """Log odds of the mapped pose after dt seconds, given the present log odds."""
         p = float(probability_of(log_odds))
         p += self.probability(dt) * (1.0 - 2.0 * p)
         return float(elementary.log(p) - elementary.log1p(-p))
 
 
 def symmetries_of(entries: Mapping[str, Any]) -> Mapping[str, Symmetry]:
-    """Build the symmetries of a model file from its rates by map.
+    """Build the symmetries from the rates in a model file, one rate per map.
 
     Raises:
         ValueError: a map is unknown or missing, or a rate is not positive.

@@ -4,9 +4,9 @@ Frame: camera optical frame of REP 103, x right, y down, z forward, m. Pixels: c
 centre of the first pixel at (0, 0).
 
 `hmt_learning.motion.viewpoint.Viewpoint` is the pose of a static camera above a level floor. The
-world frame of rendered motions has its origin on the floor, straight in front of the camera. There
-a person in the rest pose faces the camera: x to the person's right (left in the image), y towards
-the camera, z up.
+world frame of rendered motions has its origin on the floor, straight in front of the camera. In
+this frame a person in the rest pose faces the camera: x to the person's right (left in the image),
+y towards the camera, z up.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ IMAGE_UP.setflags(write=False)
 # Range of distances with 95 % of visible people, m, for a lens with the usual angle of view, rad.
 NEAR_PERSON_DISTANCE, FAR_PERSON_DISTANCE, USUAL_ANGLE_OF_VIEW = 0.4, 15.0, np.radians(60.0)
 
-MIN_DEPTH = 0.01  # minimum depth of a point that has a pixel, m
+MIN_DEPTH = 0.01  # minimum depth of a point that can be projected, m
 # Minimum component of the unit vertical across the optical axis for which the roll is defined.
 MIN_ROLL_COMPONENT = 0.1
 # Tangents of the angles at which a distortion is checked; maximum growth of the magnification
@@ -44,17 +44,18 @@ _TURNS = 0.499 * np.pi * np.linspace(0.0, 1.0, 300) ** 2
 CHECKED_RADII = elementary.sin(_TURNS) / elementary.cos(_TURNS)
 MAX_RISE = 4.0
 # Fraction of the way from the principal point to a corner up to which a distortion must not fold.
-# It covers the ends of the longer side; polynomials of real calibrations may fold farther out.
+# It covers the ends of the longer side; real calibrations may have polynomials that fold farther
+# out.
 MIN_UNFOLDED_FRACTION = 0.8
 
-# Models of distortion in compiled code.
+# Code of each distortion model in compiled code.
 LENS_CODES = {'plumb_bob': 0, 'rational_polynomial': 0, 'equidistant': 1}
 
 
 class Lens(NamedTuple):
     """A camera for compiled code: fx fy cx cy, model (-1: no distortion), coefficients.
 
-    `near` is the minimum depth of a point with a pixel, m.
+    `near` is the minimum depth of a point that can be projected, m.
     """
 
     focal: tuple[float, float]
@@ -78,7 +79,7 @@ class Camera:
 
     Raises:
         ValueError: a focal length is not positive, a value is not finite, the model is unknown or
-            has another number of coefficients, or the distortion folds well inside the image.
+            has a different number of coefficients, or the distortion folds well inside the image.
     """
 
     fx: float
@@ -124,7 +125,7 @@ class Camera:
             )
 
     def scaled(self, width: int, height: int) -> Camera:
-        """Return the same camera with images of another size, px.
+        """Return a copy of the camera with a new image size, px.
 
         Raises:
             ValueError: the aspect ratio differs by more than rounding to whole pixels.
@@ -192,7 +193,7 @@ class Camera:
         return pixels, jacobian
 
     def magnification(self, depth: float) -> float:
-        """Pixels per metre across the optical axis at a depth, m."""
+        """Pixels per metre perpendicular to the optical axis, at a depth, m."""
         return float(np.sqrt(self.fx * self.fy)) / max(depth, MIN_DEPTH)
 
     def rays(self, pixels: ArrayLike) -> Array:
@@ -207,7 +208,7 @@ class Camera:
         return result
 
     def distort(self, a: Array, b: Array) -> tuple[Array, tuple[tuple[Array, Array], ...]]:
-        """Distorted normalised coordinates (2, ...) and their derivatives d(i) / d(a, b)."""
+        """Distorted normalised coordinates (2, ...), and derivatives with respect to a and b."""
         if not self.distortion:
             one, zero = np.ones(()), np.zeros(())
             return np.stack([a, b]), ((one, zero), (zero, one))
@@ -252,10 +253,10 @@ class Camera:
 
 @lru_cache(maxsize=64)
 def unfolded_share(camera: Camera) -> float:
-    """Return the fraction of the way to the corners without a fold of the distortion, 0 to 1.
+    """Return the fraction of the way to the corners before the distortion folds, 0 to 1.
 
-    From the principal point to each corner the distorted radius must increase with the ideal one,
-    and its slope must stay below `MAX_RISE` times the smallest slope nearer the centre.
+    From the principal point to each corner the distorted radius must increase with the ideal
+    radius, and its slope must stay below `MAX_RISE` times the smallest slope nearer the centre.
     """
     x, y = (np.array([-0.5, n - 0.5]) for n in (camera.width, camera.height))
     a, b = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
@@ -273,11 +274,11 @@ def unfolded_share(camera: Camera) -> float:
 
 
 def roll(ups: ArrayLike) -> Array:
-    """Return roll rotations (..., 3, 3) from an upright camera's axes to a camera's.
+    """Return roll rotations (..., 3, 3) from an upright camera's axes to the actual camera's axes.
 
     Args:
-        ups: (..., 3) vectors against gravity, camera frame. Vectors nearly along the optical axis
-            (`MIN_ROLL_COMPONENT`), and zeros, give no roll.
+        ups: (..., 3) vectors against gravity, camera frame. The roll is zero for vectors nearly
+            along the optical axis (`MIN_ROLL_COMPONENT`) and for zeros.
     """
     x, y, _ = np.moveaxis(np.asarray(ups, dtype=np.float64), -1, 0)
     length = elementary.hypot(x, y)
@@ -312,7 +313,7 @@ def tangent(angle: float) -> float:
 
 
 def log_prior_of_distance(camera: Camera, distance: float) -> float:
-    """Return the log prior of a person's distance, m, relative to the most likely one, nats.
+    """Return the log prior of a person's distance, m, relative to the most likely distance, nats.
 
     The prior is log-normal, and wide enough to exclude no distance.
     """

@@ -62,7 +62,7 @@ class CameraPose(NamedTuple):
         return float(max(camera.fx, camera.fy) * (angle + apart / USUAL_DISTANCE))
 
     def towards(self, other: CameraPose, share: float) -> CameraPose:
-        """Interpolate to another pose at constant speed; share 0: this pose, 1: the other."""
+        """Interpolate at constant speed from this pose (share 0) to another pose (share 1)."""
         turn = rotation_vectors(product(self.rotation.T, other.rotation))
         rotation = product(self.rotation, rotations_of(share * turn))
         return CameraPose(rotation, self.position + share * (other.position - self.position))

@@ -7,16 +7,16 @@ segment) and the angle w around the axis, its surface in the frame of the segmen
     z = c_z - a_z s,
     r(s) = a (1 + t s) (1 - |s|^(2/e1))^(e1/2),   C = sgn(cos) |cos|^e2,   S = sgn(sin) |sin|^e2
 
-with three radii a, two exponents e, two tapers t and two bends b: nine shape parameters.
+The nine shape parameters are three radii a, two exponents e, two tapers t and two bends b.
 
-The occluding contour is exact: on every ring it has the points whose normal is perpendicular to the
-ray from the camera. On a ring with centre u relative to the camera, in the segment's frame, the
-condition normal . point = 0 reads
+The occluding contour is exact: on every ring it contains the points whose normal is perpendicular
+to the ray from the camera. On a ring with centre u relative to the camera, in the segment's frame,
+the condition normal . point = 0 reads
 
     g(w) = 1 + U_x C'(w) + U_y S'(w) - u_z (k_x cos^2 w + k_y sin^2 w) = 0,
 
-with U = (u - u_z lean) / radius, k the slopes, C' and S' the signed powers 2 - e2. If both slopes
-are equal and e2 = 1, the solution has a closed form (`image.surface`).
+where k are the slopes, C' and S' signed powers with exponent 2 - e2, and U = (u - u_z lean) /
+radius. If both slopes are equal and e2 = 1, the solution has a closed form (`image.surface`).
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Rings:
         radius: (R, 2) along x and y, m.
         slope: (R, 2) d log(radius) / dz, 1/m.
         lean: (R, 2) d centre / dz.
-        exponent: (R,) e2, around the ring.
+        exponent: (R,) exponent e2 of the shape around the ring.
     """
 
     centre: Array
@@ -80,7 +80,7 @@ class Rings:
 
 
 class Superquadrics(NamedTuple):
-    """P parts for the core: arrays (P, 3) and (P, 2) of their attributes."""
+    """Attributes of P parts as arrays (P, 3) and (P, 2), for the core."""
 
     centres: Array
     radii: Array
@@ -139,7 +139,7 @@ class Flesh:
 
     @cached_property
     def ring_parts(self) -> Index:
-        """Part of each ring."""
+        """Index of the part that each ring belongs to."""
         return np.repeat(np.arange(len(self.parts)), self.ring_count)
 
     def mesh(self, stacks: int = 9, slices: int = 12) -> Mesh:
@@ -162,7 +162,7 @@ class Mesh:
 
     Attributes:
         vertices, normals: (V, 3) m, outward unit vectors.
-        segments: (V,) segment of each vertex.
+        segments: (V,) index of the segment that carries each vertex.
         parts: (V,) part of each vertex.
         triangles: (F, 3) vertices, counter-clockwise seen from outside.
     """

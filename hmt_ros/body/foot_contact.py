@@ -7,9 +7,10 @@
 
 c is the probability that the point rests, m its motion since the previous image and h its height
 above the floor. With probability q, a resting point was at rest before; otherwise it has just come
-to rest. Images show little motion along the line of sight, so both deviations are wider there and
-differ less. Errors of a pose are correlated in time: evidence is weighted by the share a(dt) of an
-image in time (`hmt_ros.inference.error_model`), and errors of close images differ little.
+to rest. Images show little motion along the line of sight, so S_rest and S_free are larger in that
+direction and differ less. Pose errors are correlated in time: the evidence of an image is weighted
+by its share of time a(dt) (`hmt_ros.inference.error_model`), and pose errors differ little between
+images close in time.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def contacts(
         rested: (K, P) contact probabilities after the previous image.
         before: (K, P, 3) sole points in the previous image, in the same camera frame, m.
         dt: time since the previous image, s.
-        still: whether the motion of the camera is known; if not, foot motion is no evidence.
+        still: whether the motion of the camera is known; if not, foot motion is ignored.
     """
     prior = CONTACT_CHAIN.closed(rested, dt)
     evidence = _height_evidence(plane, points)

@@ -3,18 +3,19 @@
     E(x) = w_u sum_s rho(lean_s) + w_f sum_p rho([-h_p]+ / sigma_f)
     rho(r) = (nu + k) / 2 log(1 + r^2 / nu),     k the dimension of r
 
-`lean_s` is the direction of gravity in the frame of the pelvis or trunk, minus that of an upright
-person; h_p is the height of a point of the sole above the floor. The tails are heavy because people
-bend and lie down. A floor that is only known from the feet of the track is not used: if its height
-is overestimated, it would push the next feet up as well.
+`lean_s` is the direction of gravity in the frame of the pelvis or trunk, minus the same direction
+for an upright person; h_p is the height of a point of the sole above the floor. The tails are heavy
+because people bend and lie down. A floor that is only known from the track's own feet is not used,
+because an overestimated height would also raise the feet in later images.
 
 The soles are the contact points between the flesh of the feet and a floor. The points of a foot are
 the lowest points of its flesh when the flat foot is pitched by `PITCH` up (heel) or down (toe).
 They move with the flesh when the shape changes.
 
-Mass fractions of the segments, and distances of their centres from the upper ends relative to the
-lengths, are from [Winter, Biomechanics and Motor Control of Human Movement, 4th ed. 2009, table
-4.1, after Dempster]. Its trunk of 0.497 is split into 0.142 pelvis and 0.355 thorax and abdomen.
+The mass fractions of the segments, and the distances of their centres of mass from the upper ends
+as fractions of the segment lengths, are from [Winter, Biomechanics and Motor Control of Human
+Movement, 4th ed. 2009, table 4.1, after Dempster]. Winter's 0.497 for the trunk is split into 0.142
+for the pelvis and 0.355 for thorax and abdomen.
 """
 
 from __future__ import annotations
@@ -36,13 +37,14 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import product, unit
 
 # Mean forward lean of trunk and pelvis, and its standard deviations sideways and forwards, rad.
-# People differ: from hips to neck, the mean lean in the clips is from 9 degrees backwards to 9
-# forwards. The median of 16 people in motion capture is 2 degrees backwards for the trunk and 1 for
-# the pelvis; on the clips, 8 works better for the pelvis. The heavy tails allow bending.
+# People differ: their mean lean from hips to neck in the clips ranges from 9 degrees backwards to 9
+# degrees forwards. The median of 16 people in motion capture is 2 degrees backwards for the trunk
+# and 1 degree for the pelvis; on the clips, 8 degrees work better for the pelvis. The heavy tails
+# allow bending.
 TRUNK_LEAN, TRUNK_SIGMA = 0.0, (np.radians(5.0), np.radians(9.0))
 PELVIS_LEAN, PELVIS_SIGMA = np.radians(-8.0), (np.radians(8.0), np.radians(14.0))
-# The same for the shanks of hidden legs, which are upright in standing and sitting people. For
-# visible legs the image shows the lean.
+# Mean lean and standard deviations for the shanks of hidden legs, which are upright in standing and
+# sitting people. The lean of visible shanks is measured in the image.
 SHANK_LEAN, SHANK_SIGMA = np.radians(5.0), (np.radians(8.0), np.radians(20.0))
 # Standard deviation of the depth below an exact floor plane, m.
 FLOOR_SIGMA = 0.02
@@ -71,12 +73,12 @@ class GroundSettings:
 
     @property
     def weights(self) -> Array:
-        """Weights (2,) in the order of the attributes."""
+        """Weights (2,) of the upright term and the floor term."""
         return np.array([self.upright_weight, self.floor_weight])
 
     @property
     def on(self) -> bool:
-        """Whether any of the terms is on."""
+        """Whether any weight is positive."""
         return bool(self.weights.any())
 
 
@@ -89,8 +91,8 @@ class FloorPlane:
         up_sigma: standard deviation of the angle of `up`, rad.
         height: height of the camera above the floor, m; None: unknown.
         height_sigma: standard deviation of the floor's height at the person, m.
-        measured: whether the height is known independently of the person's own feet. If not, it
-            only describes earlier positions of the feet.
+        measured: whether the height is known independently of the person's own feet. If not, the
+            height only describes earlier positions of the feet.
     """
 
     up: Array
@@ -104,7 +106,7 @@ class Constants(NamedTuple):
     """Inputs that do not depend on the pose, for the compiled code.
 
     Attributes:
-        dof_is_rotation: (d,).
+        dof_is_rotation: (d,) whether each degree of freedom is a rotation.
         moves: (S, d) whether each degree of freedom moves each segment.
         weights: (2,) weights of the upright and the floor term; 0 switches a term off.
         up: (3,) unit vector against gravity.
@@ -135,7 +137,7 @@ class Constants(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GroundTerm:
-    """The sum of the ground terms.
+    """Energy of poses: the sum of the upright term and the floor term.
 
     Attributes:
         body: body of the poses.
@@ -181,7 +183,7 @@ class Upright(NamedTuple):
     """Segments that are upright in a standing person.
 
     Attributes:
-        segments: (U,).
+        segments: (U,) indices of the segments.
         axes: (U, 3, 3) axes in the frame of each segment; the rows point to the side, ahead and up
             when the person stands normally.
         sigma: (U, 3) standard deviations of the vertical along these axes, rad.
@@ -194,10 +196,10 @@ class Upright(NamedTuple):
 
 @lru_cache(maxsize=16)
 def upright_segments(skeleton: Skeleton, hidden: tuple[int, ...] = ()) -> Upright:
-    """Return pelvis and trunk of a skeleton whose root turns about z, y and x, else none.
+    """Return pelvis and trunk if the root of the skeleton turns about z, y and x, otherwise none.
 
     Args:
-        hidden: segments hidden from the camera; hidden shanks are included.
+        hidden: segments hidden from the camera. Hidden shanks are added to the result.
     """
     if not len(_root_turns(skeleton)) or 'neck' not in skeleton.joint_names:
         return Upright(np.zeros(0, dtype=np.intp), np.zeros((0, 3, 3)), np.zeros((0, 3)))
@@ -221,7 +223,7 @@ def upright_segments(skeleton: Skeleton, hidden: tuple[int, ...] = ()) -> Uprigh
 
 @lru_cache(maxsize=16)
 def _at_rest(skeleton: Skeleton) -> tuple[Array, Array, Array]:
-    """Columns (S, 3, 3), origins (S, 3) and joints (J, 3) at zero angles."""
+    """Axes (S, 3, 3) and origins (S, 3) of the segments, and joints (J, 3), at zero angles."""
     frames = forward(skeleton, np.zeros((1, skeleton.dimension)))
     (columns,), (origins,) = frames.segments
     return columns, origins, frames.joints()[..., 0]
@@ -243,7 +245,7 @@ def _axes(columns: Array, segment: int, along: Array, lean: float) -> Array:
 
 
 def _across(vector: Array, axis: Array) -> Array:
-    """Return the direction (3,) of the part of a vector that is perpendicular to a unit vector."""
+    """Return the unit vector (3,) along the part of a vector that is perpendicular to an axis."""
     return unit(vector - axis * (axis * vector).sum())
 
 
@@ -254,7 +256,7 @@ def root_lean_dofs(body: Body) -> Index:
 
 
 def _root_turns(skeleton: Skeleton) -> Index:
-    """Return the root rotations (3,) if they are about z, y and x; else none."""
+    """Return the root rotations (3,) if they are about z, y and x, otherwise an empty array."""
     root = np.array(skeleton.segment_dofs[0], dtype=np.intp)
     turns = root[skeleton.dof_is_rotation[root]]
     names = [skeleton.dof_names[i] for i in turns]
@@ -406,7 +408,7 @@ def _end(skeleton: Skeleton, segment: int) -> Array:
     """Return the end (3,) of a segment, m: its farthest joint or the next segment's start."""
     ends = [np.zeros(3), *skeleton.joint_offsets[skeleton.joint_segments == segment]]
     children = [s for s, parent in enumerate(skeleton.parents) if parent == segment]
-    # The mean over several child segments, such as both upper arms and the neck.
+    # There may be several child segments, such as both upper arms and the neck.
     if children:
         ends.append(np.mean([skeleton.offsets[s] for s in children], axis=0))
     return np.asarray(max(ends, key=lambda end: float((end * end).sum())), dtype=np.float64)

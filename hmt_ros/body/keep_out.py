@@ -5,13 +5,14 @@ the error of the body model and the uncertainty of its position,
 
     r = r_flesh + MARGIN + q s,       q^2 the quantile `probability` of chi^2 with 3 dimensions
 
-s is the standard deviation of its ends in the second most uncertain direction. Along the most
-uncertain direction, usually depth, the capsule is repeated over q times the deviation. Modes are
-included, heaviest first, until their weights sum to `probability`. Capsules inside others are left
-out. A lost person may have moved, so all capsules grow by `reach_after` the time since the loss.
+s is the standard deviation of the capsule's ends in their second most uncertain direction. Along
+the most uncertain direction, usually depth, the capsule is repeated over q standard deviations.
+Modes are included, heaviest first, until their weights sum to `probability`. Capsules inside other
+capsules are left out. A lost person may have moved, so the radii of all capsules grow with the time
+since the loss (`reach_after`).
 
-Only the coverage that `benchmarks/keep_out.py` measures on clips is guaranteed. It excludes people
-whose loss the tracker has not noticed, and long objects in people's hands.
+Only the coverage that `benchmarks/keep_out.py` measures on clips is guaranteed. The guarantee
+excludes people whose loss the tracker has not noticed, and long objects in people's hands.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.linear_algebra import product, symmetric_eigen
 from hmt_ros.inference.mixture import GaussianMixture
 
-# Error of the body model in its tails, m.
+# Allowance for errors of the body model, m.
 MARGIN = 0.05
 # Radius of a bone of a body without flesh, m.
 BARE_BONE_RADIUS = 0.07
@@ -77,11 +78,11 @@ class Capsules:
         return np.asarray(self.radii - np.linalg.norm(p - nearest, axis=2))
 
     def contain(self, points: ArrayLike) -> Mask:
-        """Whether each of points (P, 3) is in any capsule, (P,)."""
+        """Whether each point (P, 3) lies in at least one capsule, (P,)."""
         return np.asarray((self.depths(points) >= 0.0).any(1))
 
     def without_contained(self) -> Capsules:
-        """Drop capsules inside the union of larger ones, tested at a few surface points."""
+        """Drop capsules inside the union of larger capsules, tested at a few surface points."""
         order = np.argsort(-self._sizes, kind='stable')
         some = self[order]
         axes = (np.ascontiguousarray(x) for x in (some.starts, some.ends))
@@ -139,7 +140,7 @@ def keep_out_capsules(body: Body, mixture: GaussianMixture, probability: float =
     deep[:, :, 1] *= same[:, :, None]
     radius = radii + MARGIN + wide * across
     beyond = wide * np.maximum(along - across, 0.0)
-    # A small spread widens the capsule and needs no second one.
+    # For a small spread, widen the capsule instead of repeating it.
     little = beyond < MAX_WIDENING * radius
     radius, beyond = np.where(little, radius + beyond, radius), np.where(little, 0.0, beyond)
     steps = np.ceil(beyond / (0.5 * CAPSULE_SPACING * radius)).astype(np.intp)

@@ -1,6 +1,7 @@
 """Forward kinematics, exact Jacobians, and energies over points of the body, for N poses at once.
 
-`core/residuals.h` explains how derivatives by points become derivatives by poses.
+`core/residuals.h` explains how derivatives with respect to points give derivatives with respect to
+poses.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ class Frames:
     """Frames of the segments at N poses; camera frame, m.
 
     Attributes:
-        skeleton: the skeleton.
-        poses: (N, d) poses of the frames.
+        skeleton: skeleton of the segments.
+        poses: (N, d) poses at which the frames are computed.
         segments: columns (N, S, 3, 3) and origins (N, S, 3): columns[n, s, i] is the i-th axis of
             segment s.
         dofs: unit vectors of the degrees of freedom, and points on the axes of rotations,
@@ -103,11 +104,11 @@ class Frames:
         return self.points(self.skeleton.joint_segments, self.skeleton.joint_offsets)
 
     def by_pose(self) -> tuple[Array, Array]:
-        """Columns (N, S, 3, 3) and origins (N, S, 3), pose by pose in memory."""
+        """Axes (N, S, 3, 3) and origins (N, S, 3) of the segments, pose by pose."""
         return self.segments
 
     def dofs_by_pose(self) -> tuple[Array, Array]:
-        """Axes and points on them (N, d, 3) of the degrees of freedom, pose by pose in memory."""
+        """Axes of the degrees of freedom and points on the axes (N, d, 3), pose by pose."""
         return self.dofs
 
     def rotations(self) -> Array:
@@ -160,7 +161,7 @@ def _checked(skeleton: Skeleton, poses: ArrayLike) -> Array:
     """Poses (N, d) as an array; the core checks that they are finite.
 
     Raises:
-        ValueError: they do not have d columns.
+        ValueError: the poses do not have d columns.
     """
     q = np.ascontiguousarray(poses, dtype=np.float64)
     if q.ndim != 2 or q.shape[1] != skeleton.dimension:
@@ -193,7 +194,7 @@ def directed_derivatives(
         points, directions: (M, 3) camera frame.
 
     Returns:
-        (M, d) a . dp / dx.
+        (M, d) derivatives a . dp / dx of the points p along the directions a.
     """
     skeleton = frames.skeleton
     axes, origins = (x[0] for x in frames.dofs)
@@ -239,7 +240,8 @@ def point_energy(
         segments: (P,) segments of the points.
         local: (P, 3) positions of the points in the frames of the segments, m.
         targets: (N, P, 3) targets t, camera frame, m.
-        across: (N, P, R, 3) A, such as the projection across a ray divided by a deviation, 1/m.
+        across: (N, P, R, 3) matrices A of R rows, such as a projection perpendicular to a ray,
+            divided by a standard deviation, 1/m.
 
     Returns:
         Value (N,), gradient (N, d), Gauss-Newton Hessian (N, d, d).
@@ -259,7 +261,7 @@ class Placing(NamedTuple):
     Attributes:
         parents: (S,) parent of each segment; -1: none.
         first_dofs: (S + 1,) index of the first degree of freedom of each segment.
-        dof_axes, dof_is_rotation: (d,).
+        dof_axes, dof_is_rotation: (d,) axis and kind of each degree of freedom.
         mounts, offsets: (S, 3, 3), (S, 3) mounts and offsets of the segments, see `Skeleton`.
     """
 

@@ -1,6 +1,6 @@
 """Files of learned models: one .npz of plain arrays, verified with an example on reading.
 
-An archive names its format, the version of the format and the kind of model. It has the
+An archive names its format, the version of the format and the kind of model. It contains the
 constructor's parameters as JSON and the learned arrays. The arrays of a model inside another model
 have a prefix (`nested`, `part`). A complete file also has
 
@@ -8,8 +8,8 @@ have a prefix (`nested`, `part`). A complete file also has
 - `checksum`: SHA-256 of all other arrays, to distinguish damaged files from wrong models,
 - `example/input` and `example/answer`: an input, and the model's prediction for it.
 
-A reader builds the model, whose own code checks shapes and ranges. The arrays that the model would
-write must have the names, types and shapes of those in the file. For the stored input, the model
+A reader builds the model, whose code checks shapes and ranges. The arrays that the model would
+write must match the arrays in the file in name, type and shape. For the stored input, the model
 must give the stored answer, a mixture of finite means and positive definite covariances.
 """
 
@@ -51,7 +51,7 @@ MIN_POSITIVE, MAX_POSITIVE = 1e-15, 1e30
 MIN_VARIANCE, MAX_VARIANCE, MAX_RATIO = 1e-25, 1e12, 1e13
 # Minimum eigenvalue of a correlation matrix for its Cholesky factor.
 MIN_EIGENVALUE = 1e-13
-# Maximum difference of an answer from the stored one, in standard deviations and in nats per
+# Maximum difference of an answer from the stored answer, in standard deviations and in nats per
 # variable. Networks compute in single precision, which differs by up to 1e-5 between machines.
 TOLERANCE = 1e-3
 # Exceptions that wrong arrays can cause.
@@ -88,9 +88,9 @@ Model = TypeVar('Model', bound=LearnedModel)
 
 @contextmanager
 def named_faults(where: str) -> Iterator[None]:
-    """Convert exceptions caused by wrong arrays to a ValueError of one line, with a path.
+    """Convert exceptions caused by invalid arrays to a one-line ValueError that names the file.
 
-    Only the texts of ValueErrors are repeated, because they never contain content of the file.
+    Only messages of ValueErrors are repeated, because these never quote the file.
     """
     try:
         with np.errstate(all='ignore'):
@@ -132,7 +132,7 @@ def check_header(arrays: Mapping[str, NDArray[Any]], kind: str) -> None:
 
 
 def parameters_of(arrays: Mapping[str, NDArray[Any]], name: str = 'parameters') -> dict[str, Any]:
-    """The constructor's parameters in an archive, or its card.
+    """Read the constructor's parameters, or the card, from an archive.
 
     Raises:
         ValueError: the text is not a mapping in JSON.
@@ -143,7 +143,7 @@ def parameters_of(arrays: Mapping[str, NDArray[Any]], name: str = 'parameters') 
 
 
 def body_of(parameters: Mapping[str, Any]) -> Body:
-    """Load the shipped body named in a file; the name must not open other files.
+    """Load the shipped body named in a file; a name cannot open any other file.
 
     Raises:
         ValueError: no body ships under this name.
@@ -168,7 +168,8 @@ def check_covariances(name: str, values: Array, slack: float = -MIN_EIGENVALUE) 
             semidefinite matrices.
 
     Raises:
-        ValueError: they are not symmetric and positive definite, or variances are out of range.
+        ValueError: the covariances are not symmetric and positive definite, or variances are out of
+            range.
     """
     variances = np.diagonal(values, axis1=-2, axis2=-1)
     least, largest = variances.min(initial=1.0), variances.max(initial=1.0)
@@ -208,7 +209,7 @@ def write_model(
     whole = {**card, 'numbers': sum(values.size for values in arrays.values())}
     arrays |= {'card': np.array(json.dumps(whole, sort_keys=True)), _EXAMPLE_INPUT: example}
     with named_faults(str(path)):
-        # The model read back, so that its answer has the precision of the file.
+        # Read the model back, so that its answer has the precision of the file.
         arrays[_EXAMPLE_OUTPUT] = _answer(read(arrays), arrays)
         arrays['checksum'] = np.array(checksum(arrays))
         checked_model(arrays, read)
@@ -223,7 +224,8 @@ def read_model(path: str | Path, kind: str, read: Callable[[Arrays], Model]) -> 
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: the file has another format, version or kind, or is damaged or invalid.
+        ValueError: the file has an unsupported format or version, is of a different kind, damaged
+            or invalid.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f'{path}: no such model file; train or learn one')
@@ -261,7 +263,7 @@ def checked_model(arrays: Arrays, read: Callable[[Arrays], Model]) -> Model:
 
 
 def checksum(arrays: Mapping[str, NDArray[Any]]) -> str:
-    """SHA-256 of the names, types, shapes and values of all arrays but the checksum."""
+    """SHA-256 of the names, types, shapes and values of all arrays except the checksum."""
     result = hashlib.sha256()
     for name, values in sorted(arrays.items()):
         if name != 'checksum':
@@ -316,12 +318,12 @@ def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> Path:
 
 
 def nested(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
-    """The arrays with names under a prefix, as part of a larger archive."""
+    """Return the arrays under prefixed names, for use in a larger archive."""
     return {f'{prefix}/{name}': value for name, value in arrays.items()}
 
 
 def part(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
-    """The arrays that `nested` put under a prefix."""
+    """Return the arrays that `nested` stored under a prefix."""
     opening = f'{prefix}/'
     return {
         name.removeprefix(opening): value

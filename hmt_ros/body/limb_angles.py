@@ -28,7 +28,7 @@ ARM = ('shoulder', 'elbow', 'wrist', 'hand')
 LEG = ('hip', 'knee', 'ankle', 'toe')
 # Weights of the cues for the twist of a limb; a hinge bent by a right angle has weight 1.
 FOOT_WEIGHT = 0.3  # direction of the foot, for the leg
-NEIGHBOUR_WEIGHT, AROUND_TIME = 0.2, 0.2  # neighbouring frames; standard deviation of their time, s
+NEIGHBOUR_WEIGHT, AROUND_TIME = 0.2, 0.2  # neighbouring frames; smoothing time, s
 ZERO_TWIST_WEIGHT = 1e-3  # zero twist, the default
 HIPS = ('pelvis', 'left_hip', 'right_hip')
 TRUNK_START = 'start of the trunk'
@@ -39,9 +39,11 @@ def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float | Non
     """Fit poses (T, d) to joint positions with standard names.
 
     Args:
-        skeleton: skeleton with the limbs of KJS fig. 3, such as those of the shipped bodies.
+        skeleton: skeleton with the limbs of KJS fig. 3, such as the skeletons of the shipped
+            bodies.
         place: positions (T, 3) of each joint, camera frame, m; toes and hands may be missing.
-        fps: frames per second of a sequence, whose headings are unwrapped; None: independent poses.
+        fps: frames per second of a sequence, in which headings are unwrapped; None for independent
+            poses.
 
     Raises:
         ValueError: the skeleton has other limbs.
@@ -84,7 +86,8 @@ def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float | Non
 def trunk_start(skeleton: Skeleton, place: Mapping[str, Array]) -> Array:
     """Return the start of the trunk (T, 3), from the pelvis and the hips.
 
-    Its offset from the pelvis, in units of the distance from pelvis to hips, is as at rest.
+    Its offset from the pelvis, relative to the distance from pelvis to hips, is as in the rest
+    pose.
     """
     if 'neck' not in skeleton.chains:
         return place['pelvis']
@@ -139,7 +142,7 @@ def _set_root(skeleton: Skeleton, place: Mapping[str, Array], poses: Array) -> A
     """Set the root's degrees of freedom from the joints of the trunk; return its rotation."""
     rotations = root_rotation_dofs(skeleton)
     shifts = skeleton.dof_index(('root_tx', 'root_ty', 'root_tz'))
-    flexible = bool(skeleton.moves[skeleton.chains['neck'][0]].sum() > 8)  # root and neck have 8
+    flexible = bool(skeleton.moves[skeleton.chains['neck'][0]].sum() > 8)  # root and neck give 8
     names = ['pelvis', 'left_hip', 'right_hip', 'neck', 'left_shoulder', 'right_shoulder']
     weights = np.array([1.0, 1.0, 1.0, *([FLEXIBLE_WEIGHT if flexible else 1.0] * 3)])
     at_rest = forward(skeleton, np.zeros((1, skeleton.dimension))).joints()[..., 0]
@@ -185,8 +188,8 @@ def _twist(
 ) -> Array:
     """Return the third angle of a spherical joint, the twist, from the next segments.
 
-    In a limb it follows from a bent hinge, or from the foot of a straight leg, or else from
-    neighbouring frames. In the trunk it follows from the line of the shoulders.
+    In a limb the twist follows from a bent hinge, or from the foot of a straight leg, or else from
+    neighbouring frames. In the trunk the twist follows from the line of the shoulders.
     """
     if not next_end:
         line = _local(turn, place['right_shoulder'] - place['left_shoulder'])

@@ -1,13 +1,13 @@
 """Mirror images of poses: left-right, and in depth, which silhouettes do not show.
 
-A body is left-right symmetric. If it is mirrored in the plane through the pelvis across the line of
-sight, its silhouette stays the same, apart from perspective: a person who approaches looks like a
-person who walks away. The joint angles of the result are those of the left-right mirrored pose, so
-they lie within the limits, too.
+A body is left-right symmetric. If it is mirrored in the plane through the pelvis perpendicular to
+the line of sight, its silhouette stays the same, apart from perspective: a person who approaches
+looks like a person who walks away. The joint angles of the result are those of the left-right
+mirrored pose, so they lie within the limits, too.
 
 Angles without limits are equal modulo a whole turn. The heading of a turning person can pass 180
 degrees, and two estimates of one heading may differ by a turn. Whole turns must be removed before
-poses are compared by their variables.
+poses are compared variable by variable.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MAX_SIDEWAYS_SINE = 0.12
 # Axes of the root's rotations, in the order in which they act.
 ROOT_AXES = 'zyx'
 TURN = 2.0 * np.pi
-# Ratio of root angles to their limits below which they count as far from limits and poles.
+# Fraction of the limit below which a root angle is far from limits and singularities.
 CLEARANCE_RATIO = 0.85
 QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -55,7 +55,7 @@ def mirror_order(skeleton: Skeleton) -> tuple[Index, Array]:
 
 
 def reverse_depth(body: Body, poses: ArrayLike) -> Array:
-    """Poses (N, d) mirrored in the plane through the pelvis across the line of sight.
+    """Mirror poses (N, d) in the plane through the pelvis perpendicular to the line of sight.
 
     Args:
         body: body whose root turns about z, y and x.
@@ -93,7 +93,7 @@ def root_rotation_dofs(skeleton: Skeleton) -> Index:
 
 
 def rotations_of(skeleton: Skeleton, segment: int) -> tuple[list[int], str]:
-    """The rotations of a segment, and their axes in this order, such as 'zyx'."""
+    """The rotational degrees of freedom of a segment, and their axes, such as 'zyx'."""
     own = [j for j in skeleton.segment_dofs[segment] if skeleton.dof_is_rotation[j]]
     return own, ''.join('xyz'[skeleton.dof_axes[j]] for j in own)
 
@@ -120,7 +120,7 @@ def root_angles(body: Body, rotations: Array) -> Array:
 def turned(
     body: Body, poses: Array, to: Body, rotation: Array | None = None, turn: float = 0.0
 ) -> Array:
-    """Rotate the roots of poses (N, d), for a body that may have another level.
+    """Rotate the roots of poses (N, d) and convert the poses to a new level of the body.
 
     Args:
         body: body of the poses.
@@ -142,9 +142,9 @@ def turned(
 def turn_jacobians(
     body: Body, before: Array, to: Body, after: Array, rotation: Array | None = None
 ) -> Array:
-    """Derivatives (N, d, d) of `turned` at poses (N, d), whose results are `after`."""
+    """Derivatives (N, d, d) of `turned` at poses `before` (N, d); its results are `after`."""
     root = root_rotation_dofs(body.skeleton)
-    # Columns are the axes that the angles turn about.
+    # The columns are the rotation axes of the angles.
     old, new = (
         forward(one.skeleton, poses).axes[root].transpose(2, 1, 0)
         for one, poses in ((body, before), (to, after))
@@ -156,7 +156,7 @@ def turn_jacobians(
 
 
 def relevelled(body: Body, mixture: GaussianMixture, to: Body) -> GaussianMixture:
-    """Convert a mixture over poses to one for the same body with another level."""
+    """Convert a mixture over poses of a body to a new level of the body."""
     if np.array_equal(body.level, to.level):
         return mixture
     means = turned(body, mixture.means, to)
@@ -166,9 +166,9 @@ def relevelled(body: Body, mixture: GaussianMixture, to: Body) -> GaussianMixtur
 
 
 def clear_level(body: Body, pose: Array) -> Array:
-    """Return a level (3, 3) with the root angles of a pose (d,) far from their limits.
+    """Return a level (3, 3) at which the root angles of a pose (d,) are far from their limits.
 
-    It is the level of the body if that suffices, else this level rotated by quarter turns.
+    The body's own level is returned if it suffices, otherwise that level rotated by quarter turns.
     """
     best, least = body.level, CLEARANCE_RATIO
     if not {*ROOT_ANGLES} <= {*body.dof_names}:
@@ -212,7 +212,7 @@ def trunk_of(body: Body) -> Trunk:
 
 
 def left_directions(body: Body, poses: Array) -> Array:
-    """Unit vectors (N, 3) to the left of the persons in poses (N, d), in the camera frame.
+    """Unit vectors (N, 3) towards the persons' left in poses (N, d), camera frame.
 
     Raises:
         ValueError: the body has neither shoulders nor hips.
@@ -223,10 +223,10 @@ def left_directions(body: Body, poses: Array) -> Array:
 
 
 def faces_back(body: Body, joints: Array, reference: Array) -> Mask:
-    """Whether persons with joints (N, J, 3) face another direction than a reference (J, 3).
+    """Whether persons with joints (N, J, 3) and a reference (J, 3) face different directions.
 
     True if the directions differ by more than 90 degrees, or if one person clearly faces the camera
-    and the other faces away: in a side view, a turn may continue either way.
+    and the other faces away. In a side view, a turn may continue in either direction.
 
     Raises:
         ValueError: the body has neither shoulders nor hips.
@@ -250,7 +250,7 @@ def free_limits(body: Body) -> tuple[Array, Array]:
 
 
 def without_turns(body: Body, poses: Array, before: Array) -> Array:
-    """Shift angles of poses (K, d) to within half a turn of the nearest pose `before` (L, d).
+    """Shift angles of poses (K, d) by whole turns towards the nearest of the poses `before` (L, d).
 
     The nearest pose has the smallest mean distance between joints relative to the first joint,
     which does not depend on whole turns.

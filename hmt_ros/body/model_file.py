@@ -39,10 +39,10 @@ AXES = {
     'tz': (2, False),
 }
 MIRROR = np.array([-1.0, 1.0, 1.0])
-DIFFUSION = (0.25, 1.4)  # default of a root, m and rad after one second
+DIFFUSION = (0.25, 1.4)  # default diffusion of a root in one second, m and rad
 MAX_COORDINATE = 1000.0  # upper bound of lengths, m
 MAX_RINGS = 100
-MAX_FILE_BYTES = 250_000  # maximum size, bytes; a body is a few kB
+MAX_FILE_BYTES = 250_000  # maximum size of a model file, bytes; usual is a few kB
 
 
 def model_names() -> list[str]:
@@ -68,8 +68,8 @@ def load_body(source: str | Path) -> Body:
     `hmt_learning.motion.motion_file.read_skeleton` reads the skeleton of a motion file.
 
     Raises:
-        FileNotFoundError: neither a file nor a known name.
-        ValueError: the file is not a body; the message names the file and the entry.
+        FileNotFoundError: the argument is neither a file nor a known name.
+        ValueError: the file does not describe a body; the message names the file and the entry.
     """
     try:
         with np.errstate(all='ignore'):  # a body whose numbers overflow is refused
@@ -168,13 +168,13 @@ def _whole(content: Any) -> dict[str, Any]:
 
 
 def _sides(template: str) -> list[tuple[str, str]]:
-    """Expand a template to names and their sides; a name without a side counts as right."""
+    """Expand a template to (name, side) pairs; names without a side get the right side."""
     sides = ('left', 'right') if '{side}' in template else ('right',)
     return [(template.replace('{side}', side), side) for side in sides]
 
 
 def _linear(term: Any, names: tuple[str, ...]) -> tuple[float, Array]:
-    """Parse a number, or 'factor * length', to a constant and coefficients over the lengths."""
+    """Parse a number or 'factor * length' to a constant and the coefficients of all lengths."""
     coefficients = np.zeros(len(names))
     if isinstance(term, (int, float)):
         return float(term), coefficients
@@ -186,7 +186,7 @@ def _linear(term: Any, names: tuple[str, ...]) -> tuple[float, Array]:
 
 
 def _mount(entry: dict[str, Any]) -> Array:
-    """Return the rotation with the given x axis and -z along the segment."""
+    """Return the rotation with the given x axis whose -z axis points along the segment."""
     x = np.array(entry.get('x_axis', [1, 0, 0]), dtype=float)
     down = np.array(entry.get('points', [0, 0, -1]), dtype=float)
     x /= length(x)
@@ -441,7 +441,7 @@ def conditioned_covariance(covariance: Array, functions: ArrayLike, sigma: Array
     Args:
         covariance: (L, L) prior covariance.
         functions: (M, L) matrix H.
-        sigma: (M,) standard deviations of the known H l, above 0.
+        sigma: (M,) standard deviations of the known values of H l, positive.
     """
     rows = np.asarray(functions, dtype=np.float64)
     noise = np.diag(np.asarray(sigma, dtype=np.float64) ** 2)

@@ -80,7 +80,7 @@ class LearnedMotion:
         """The motion prior that `to_arrays` and a card describe.
 
         Raises:
-            ValueError, KeyError, TypeError: arrays or parameters are missing, or wrong.
+            ValueError, KeyError, TypeError: arrays or parameters are missing or invalid.
         """
         parameters, card = parameters_of(arrays), parameters_of(arrays, 'card')
         names = tuple(map(str, parameters['dof_names']))
@@ -92,14 +92,14 @@ class LearnedMotion:
         return made
 
     def answer(self, given: Array) -> GaussianMixture:
-        """Predict the state after `INTERVAL` from a state (2 d,)."""
+        """Predict the state after `INTERVAL` seconds from a given state (2 d,)."""
         nothing = np.zeros((1, len(given), len(given)))
         moved = self.dynamics.predict(given[None], nothing, INTERVAL)
         return GaussianMixture(np.ones(1), *moved)
 
 
 def motion_prior(body: Body) -> LinearGaussianDynamics:
-    """The dynamics of the poses of a body, learned if the body ships with a file."""
+    """Return the dynamics of a body's poses, learned if a file ships with the body."""
     learned = shipped_motion(body.name)
     if learned is None or learned.dof_names != tuple(body.dof_names):
         return LinearGaussianDynamics.random_walk(body.rates)
@@ -108,7 +108,7 @@ def motion_prior(body: Body) -> LinearGaussianDynamics:
 
 @cache
 def shipped_motion(name: str) -> LearnedMotion | None:
-    """Return the shipped motion prior for the name of a body; None if missing.
+    """Return the shipped motion prior for a body name, or None if missing.
 
     Raises:
         ValueError: the shipped file is damaged.
@@ -122,6 +122,6 @@ def read_motion_prior(path: str | Path) -> LearnedMotion:
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: the file is not a motion prior, or is damaged; one line.
+        ValueError: the file is not a motion prior, or is damaged; one-line message.
     """
     return read_model(path, KIND, LearnedMotion.from_arrays)

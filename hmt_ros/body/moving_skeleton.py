@@ -31,9 +31,10 @@ class MovingSkeleton:
 
     Attributes:
         times: (T,) s, increasing.
-        names, parents: (N,) name and parent of each node; parents come first; -1: the root.
+        names, parents: (N,) name of each node and index of its parent, -1 for the root; parents
+            come before their children.
         offsets: (N, 3) offset from the parent, in the parent's axes, m; 0 for the root.
-        rotations: (T, N, 3, 3) from the axes of the node to those of its parent.
+        rotations: (T, N, 3, 3) from the axes of the node to the axes of its parent.
         places: (T, 3) positions of the root, m.
     """
 
@@ -52,7 +53,7 @@ class MovingSkeleton:
 
         Args:
             body: body with translations at the root only.
-            poses: (T, d).
+            poses: (T, d) poses of the body.
             times: (T,) s, increasing.
             room: (3, 3) rotation from the frame of the camera to axes with y up.
             height: height of the camera in the room, m.
@@ -146,8 +147,9 @@ def _text(values: Array) -> str:
 def _angles(rotations: Array) -> Array:
     """Angles (T, N, 3) about z, x and y of rotations (T, N, 3, 3), degrees, without needless jumps.
 
-    Two triples of angles, and their whole turns, give the same rotation. The result is the triple
-    nearest to the previous time, because programs interpolate each angle separately.
+    Two triples of angles give the same rotation, and whole turns can be added to both. The result
+    is the triple nearest to the angles at the previous time, because programs interpolate each
+    angle separately.
     """
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')  # at 90 degrees about x, one angle is free

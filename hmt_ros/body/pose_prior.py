@@ -8,8 +8,8 @@ responsibilities r_c of the components c, their precisions P_c and g_c = P_c (a 
 
     dE = sum_c r_c g_c,     H = sum_c r_c P_c,     d2E = H - sum_c r_c g_c g_c' + dE dE'
 
-H is positive definite, and the quadratic with Hessian H and the value and gradient of E is an upper
-bound of E.
+H is positive definite, and the quadratic with Hessian H that has the same value and gradient as E
+is an upper bound of E.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class AnglePrior:
 
 @dataclass(frozen=True, eq=False)
 class MixturePrior:
-    """The learned prior of the poses, zero at the most probable pose.
+    """Energy of the learned prior of the poses, zero at the most probable pose.
 
     Attributes:
         body: body of the poses; its Gaussians cover degrees of freedom missing in the mixture.

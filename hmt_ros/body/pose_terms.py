@@ -1,4 +1,4 @@
-"""Energy terms over poses that read the frames of a body (KJS 2)."""
+"""Energy terms that depend on poses through the frames of the body's segments (KJS 2)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hmt_ros.inference.energy import Derivatives, Energy
 
 
 class FrameTerm(Protocol):
-    """Interface of a custom energy term that reads a pose through the frames of its segments."""
+    """Interface of a custom energy term that depends on a pose through the segment frames."""
 
     def energy(
         self, frames: Frames, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE

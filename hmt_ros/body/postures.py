@@ -26,7 +26,7 @@ from hmt_ros.inference.mixture import GaussianMixture
 # Share of the mode's own prediction for a limb hidden for a long time, and time constant of the
 # decay from 1 to this share, s. Chosen on clips.
 PREDICTION_SHARE, FORGETTING_TIME = 0.5, 1.0
-# Minimum weight of a component, a posture of a mode, that is kept.
+# Minimum weight of a component (a mode with a posture) that is kept.
 MIN_WEIGHT = 0.006
 # Joints that stay fixed while the pelvis turns.
 FIXED_JOINTS = ('neck', 'left_shoulder', 'right_shoulder')
@@ -56,8 +56,9 @@ class Postures:
                 never.
 
         Returns:
-            N components, heaviest first: each mode, and each mode with each likely posture; the
-            mode of each component (N,); and its posture (N,), 0 for the mode's own.
+            A mixture of N components, heaviest first: every mode itself, and every mode with each
+            likely posture. Index (N,) of the mode of each component. Number (N,) of the posture of
+            each component, 0 for the mode's own prediction.
         """
         spine = np.isin(self.body.skeleton.dof_segments, self.body.skeleton.spine)
         hidden, variances = np.flatnonzero((unseen > 0.0) & ~spine), self.sigmas**2
@@ -95,12 +96,13 @@ class Postures:
     def _swaying(self, poses: Array, unseen: Array) -> Array:
         """Return covariances (N, d, d) of a pelvis that turns below a fixed trunk.
 
-        The angles between pelvis and trunk have the variances of the soft prior, or smaller ones
-        if they were seen recently.
+        The angles between pelvis and trunk have the variances of the soft prior, or smaller
+        variances if they were seen recently.
 
         Args:
             poses: (N, d).
-            unseen: (d,) time since an image last showed each of these angles, s; 0 for others.
+            unseen: (d,) time since an image last showed each of these angles, s; 0 for all other
+                variables.
         """
         skeleton = self.body.skeleton
         own = np.flatnonzero(unseen > 0.0)

@@ -1,7 +1,7 @@
 """Rasterisation of a body's flesh: the triangles of its mesh that face a camera, and silhouettes.
 
 Triangles are cut into spans of pixels, all in numpy over whole arrays. A pixel belongs to a
-triangle when its centre lies inside; neighbouring triangles share no pixel and leave none out.
+triangle when its centre lies inside; neighbouring triangles share no pixel and leave no gap.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.inference.arrays import Array, Index, Mask
 
 STACKS, SLICES = 13, 18  # mesh of a part; its outline is exact to 2 % of its radius
-MIN_AREA = 1e-6  # px^2, twice the area of a triangle; smaller ones cover no pixel centre
+MIN_AREA = 1e-6  # px^2, twice the area of a triangle; smaller triangles cover no pixel centre
 BATCH_SIZE = 16  # number of poses whose silhouettes are drawn together
 
 
@@ -90,8 +90,8 @@ def project(mesh: Mesh, points: Array, camera: Camera) -> Triangles:
     p = np.ascontiguousarray(points.transpose(1, 0, 2))
     (u, v), _ = camera.project_with_derivative(p, derivative=False)
     a, b, c = mesh.triangles.T
-    # Counter-clockwise from outside is clockwise where the v axis points down. A corner behind the
-    # camera is NaN, and the triangle is left out.
+    # Triangles that are counter-clockwise from outside are clockwise in the image, because v points
+    # down. A corner behind the camera is NaN, and the triangle is left out.
     area = (u[b] - u[a]) * (v[c] - v[a]) - (v[b] - v[a]) * (u[c] - u[a])
     visible = area < -MIN_AREA
     # Far outside the image, a distortion model may map points back into it.
@@ -129,7 +129,7 @@ def fill(triangles: Triangles, height: int, width: int) -> Filled:
 
 
 def _first(places: Array, size: int) -> Index:
-    """Return the first integer at or after each place, within an image."""
+    """Round places up to integers, clipped to the image."""
     return np.clip(np.ceil(places), 0, size).astype(np.intp)
 
 

@@ -11,9 +11,9 @@ angles the person stands upright with hanging arms and legs. Joints, parent link
     body -l_y_hip, l_p_hip, l_r_hip-> l_hip              -z, x, -y (right: only x is mirrored)
     l_hip -l_knee-> l_knee -> l_ankle                    -y
 
-The reference has a trunk that only leans forward, with shoulders fixed on it. The four added joints
-let the trunk bend sideways and twist and the shoulders lift, so that the model passes through all
-joint positions; `additions=False` leaves them out.
+In the reference the trunk only leans forward, and the shoulders are fixed to it. The four added
+joints let the trunk bend sideways and twist and the shoulders lift, so that the model passes
+through all joint positions; `additions=False` leaves them out.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ NEEDED_JOINTS = (
 _PARALLEL_SINE, _ZERO_LENGTH = 1e-4, 1e-3
 # Angle by which our bodies have the hips in front of the vertical through the pelvis joint, rad.
 HIP_ANGLE = elementary.arctan(0.33)
-# Weight of the change of angles between images relative to the excess over their ranges.
+# Weight of the change of an angle between images, relative to its excess over the range.
 _CHANGE_WEIGHT = 0.2
 
 
@@ -93,7 +93,7 @@ class ReferenceHuman:
     Attributes:
         joints: joints of the model at the person's lengths, parents before their children.
         angles: angle of each movable joint, in [-pi, pi), rad.
-        rotation: (3, 3) from the body's frame to that of the joint positions.
+        rotation: (3, 3) from the body's frame to the frame of the joint positions.
         origin: (3,) origin of the body, m.
     """
 
@@ -103,7 +103,7 @@ class ReferenceHuman:
     origin: Array
 
     def links(self) -> tuple[list[str], Array, Array]:
-        """Return names (L), rotations (L, 3, 3) and origins (L, 3), m, of all links but the body.
+        """Return names (L), rotations (L, 3, 3) and origins (L, 3), m, of links except the body.
 
         Rotations and origins are in the frame of the body.
         """
@@ -137,11 +137,11 @@ def fit_reference_human(
         names: (J) names of the joints.
         positions: (J, 3) positions in any right-handed frame, m.
         previous: angles in the previous image; None: all zero.
-        additions: whether the model has the added joints. Without them limbs keep their directions,
-            and the shoulders are at their places in the reference.
+        additions: whether the model has the added joints. Without these joints, limbs keep their
+            directions, and the shoulders are placed as in the reference.
 
     Raises:
-        ValueError: a needed joint is missing, or both joints of a bone are at one place.
+        ValueError: a required joint is missing, or the two joints of a bone coincide.
     """
     missing = [name for name in NEEDED_JOINTS if name not in names]
     if missing:
@@ -276,7 +276,7 @@ def _fit_leg(
 def _best_angles(
     found: Sequence[tuple[float, ...]], names: Sequence[str], before: Mapping[str, float]
 ) -> tuple[float, ...]:
-    """Choose the best of several sets of angles for one direction, by ranges and last values."""
+    """Choose the set of angles with the least excess over the ranges and the least change."""
 
     def cost(each: tuple[float, ...]) -> float:
         terms = zip(each, (RANGES[name] for name in names), names, strict=True)

@@ -1,4 +1,4 @@
-"""Prior of trajectories with points of the body at rest on the ground, which do not move.
+"""Prior of trajectories in which points of the body rest on the ground.
 
 Whether a point rests or moves is a Markov chain with the rate `CHANGE_RATE`. The evidence is the
 speed of the point along a trajectory,
@@ -6,7 +6,7 @@ speed of the point along a trajectory,
     rests: v_across ~ N(0, 0.07^2), v_away ~ N(0, 0.17^2)    moves: N(0, 0.7^2), N(0, 0.6^2)   m/s
 
 across and along the most uncertain direction of a point, approximately the line of sight. Between
-two images a point that rests with probability r costs
+two images a point that rests with probability r has the cost
 
     r |p(x_{t+1}) - p(x_t)|^2 / (2 q dt)                      q: slip of a resting point, m^2/s
 
@@ -45,9 +45,9 @@ class RestingTable(NamedTuple):
     """R linearised coordinates of points that rest along a trajectory.
 
     Attributes:
-        jacobians: (T, R, d).
+        jacobians: (T, R, d) derivatives of the coordinates with respect to the poses.
         places: (T, R) linearised coordinates, extrapolated to the pose 0, m.
-        weights: (T-1, R) r / (q dt).
+        weights: (T-1, R) weights r / (q dt) of the cost.
     """
 
     jacobians: Array
@@ -62,11 +62,11 @@ class RestingTable(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RestingPoints:
-    """Points that may rest, in a static frame.
+    """Points of the body that may rest on the ground, in a static frame.
 
     Attributes:
         points: maps poses (N, d) to points (N, P, 3), m.
-        jacobians: maps poses (N, d) to their derivatives (N, P, 3, d).
+        jacobians: maps poses (N, d) to the derivatives (N, P, 3, d) of the points.
     """
 
     points: Callable[[Array], Array]
@@ -133,7 +133,8 @@ def rest_probabilities(
     """Probabilities (T-1, P) that a point rests from one pose of a trajectory to the next.
 
     Args:
-        points, jacobians: (T, P, 3), and their derivatives (T, P, 3, d) with respect to the poses.
+        points, jacobians: points (T, P, 3) and their derivatives (T, P, 3, d) with respect to the
+            poses.
         covariances: (T, d, d); only the most uncertain direction of each point is used.
         intervals: (T-1,) s.
     """

@@ -1,7 +1,7 @@
 """Soft prior against intersections of parts of the body (KJS 2).
 
-The overlap of two parts is the sum of their radii minus the distance of their axes, both along the
-shortest line between the axes. The penalty is quadratic in the overlap.
+The overlap of two parts is the sum of their radii minus the distance between their axes, both along
+the shortest line between the axes. The penalty is quadratic in the overlap.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class SelfIntersection:
     Derivatives neglect the change of radii as elliptic cross-sections rotate.
 
     Attributes:
-        body: body of the parts; pairs of neighbours along the skeleton are left out.
+        body: the body; pairs of neighbours along the skeleton are left out.
         sigma: overlap with energy 1/2, m; inf switches the prior off.
     """
 
@@ -117,7 +117,7 @@ def _pairs(body: Body) -> tuple[Index, Index]:
     fleshy = {p.segment for p in parts}
 
     def fleshy_parent(s: int) -> int:
-        """The nearest segment above that carries flesh."""
+        """The nearest ancestor segment that carries flesh."""
         step = parents[s]
         while step >= 0 and step not in fleshy:
             step = parents[step]

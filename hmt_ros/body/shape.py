@@ -3,9 +3,9 @@
     theta = (lengths - lengths of the body, growth of each group of parts)
 
 Left and right parts grow equally, so a group is a part or a pair of parts. A point p on a part
-moves with the shape: its segment moves with the lengths of its ancestors, and on the part it has
-the constant relative position u = (p - c) / r, for the radii r and the centre c, which depend on
-the shape:
+moves with the shape. The segment of the part moves with the lengths of its ancestors. On the part,
+the point has the constant relative position u = (p - c) / r, where the centre c and the radii r
+depend on the shape:
 
     dp / dtheta = d origin / dtheta + R (dc / dtheta + u dr / dtheta)
 
@@ -68,7 +68,7 @@ class ShapeSpace:
 
     @property
     def prior(self) -> tuple[Array, Array]:
-        """Standard deviations over people (P,) and covariance of this person (P, P)."""
+        """Standard deviations (P,) over people, and covariance (P, P) for this person."""
         lengths = np.maximum(self.body.length_sigma, MIN_LENGTH_SIGMA)
         unknown = lengths**2 - np.diagonal(self.body.length_covariance)
         grown = np.tile(np.array(list(GROWTH_SIGMAS.values())), len(self.groups))
@@ -79,7 +79,7 @@ class ShapeSpace:
         return sigmas, covariance
 
     def moved(self, change: Array) -> Body:
-        """Return the body with a changed shape (P,): lengths in m, then `GROWTH_COLUMNS`."""
+        """Return the body after a change (P,) of shape: lengths in m, then `GROWTH_COLUMNS`."""
         names, own = self.body.skeleton.length_names, self.body.skeleton.lengths
         lengths = own + change[: self.lengths]
         grown = change[self.lengths :].reshape(len(self.groups), len(GROWTH_COLUMNS))[self._group]
@@ -89,13 +89,14 @@ class ShapeSpace:
     def second_order(
         self, frames: Frames, of_flesh: Array, of_joints: Array
     ) -> tuple[Array, Array, Array]:
-        """Sum over residuals of N poses; r and q are their derivatives by shape and pose.
+        """Sum products of the derivatives of residuals of N poses: r by shape, q by pose.
 
         Args:
             frames: frames of the poses.
             of_flesh: (N, 1 + M, 9) residuals of points on the flesh. Row 0 starts with the count m.
-                Rows 1 to m contain the segment, the point and the derivative of the residual by the
-                point, camera frame, and derivative g and curvature c of the energy by the residual.
+                Rows 1 to m contain the segment; the point and the derivative of the residual with
+                respect to it, camera frame; and the first derivative g and second derivative c of
+                the energy with respect to the residual.
             of_joints: the same for joints, with joints in place of segments.
 
         Returns:
@@ -183,8 +184,9 @@ class _ShapeTable(NamedTuple):
 
     Attributes:
         part_of: (S,) part on each segment; -1 if missing.
-        centres, radii: (B, 3) of the parts.
-        by_centre, by_radius: (B, 3, P) derivatives of centres and radii by the variables.
+        centres, radii: (B, 3) centres and radii of the parts.
+        by_centre, by_radius: (B, 3, P) derivatives of centres and radii with respect to the
+            variables.
         joint_basis: (J, 3, L) of the skeleton.
         variables, counts: (S, V), (S,) variables that move the flesh of each segment; their number.
     """

@@ -29,8 +29,8 @@ class Skeleton:
     """A kinematic tree with S segments, d degrees of freedom, J joints and L lengths.
 
     Attributes:
-        segment_names, parents: (S,) name and index of the parent (-1: the camera frame); parents
-            come before their children.
+        segment_names, parents: (S,) name of each segment and index of its parent (-1: the camera
+            frame); parents come before their children.
         mounts: (S, 3, 3) rotation from the segment's frame at rest to its parent's frame.
         fixed_offsets, offset_basis: (S, 3), (S, 3, L): offset of a segment in its parent's frame =
             fixed + basis @ lengths, m.
@@ -187,7 +187,7 @@ class Skeleton:
         for j, s in enumerate(self.joint_segments):
             if not np.any(self.joint_offsets[j]):
                 at_start.setdefault(int(s), j)
-        for s, parent in enumerate(self.parents):  # a segment with the same start as a sibling
+        for s, parent in enumerate(self.parents):  # siblings with the same origin share the joint
             for other, joint in list(at_start.items()):
                 same = parent == self.parents[other] and parent >= 0
                 if s not in at_start and same and np.allclose(self.offsets[s], self.offsets[other]):
@@ -218,7 +218,7 @@ class Skeleton:
         return _positions(tuple(names), self.joint_names, 'joint', self.name)
 
     def with_lengths(self, lengths: Mapping[str, float]) -> Skeleton:
-        """Return the same skeleton with other values (m) of some lengths.
+        """Return a copy of the skeleton with new values (m) of some lengths.
 
         Raises:
             KeyError: the skeleton lacks a name.

@@ -1,1 +1,1 @@
-"""Detectors of people in images, whose networks are not part of this package."""
+"""Detectors of people in images; their networks are not part of this package."""

@@ -1,15 +1,16 @@
 """BlazePose, the detector of MediaPipe Pose: 33 landmarks of one person, in pixels and in metres.
 
-Two networks find the landmarks. The first one searches the whole image for a person, and outputs
-the middle of the hips and a point on a circle around the body. The second one sees the square
-around this circle, turned upright, and outputs landmarks, positions and a mask. Two of its outputs
-define the circle again, so that the next image needs only the second network. One-euro filters
-smooth landmarks and circle:
+Two networks find the landmarks. The first one searches the whole image for a person, and outputs a
+circle around the body: its centre, which is the middle of the hips, and a point on it. The second
+one receives the square around this circle, turned upright, and outputs landmarks, positions and a
+mask. It also outputs the circle for the next image, which therefore needs only the second network.
+One-euro filters smooth landmarks and circle:
 
     y_t = y_(t-1) + a(f) (x_t - y_(t-1)),    f = f_0 + b |v_t|,    a(f) = 1 / (1 + 1 / (2 pi f dt))
 
 with the smoothed velocity v_t of x_t (Casiez, Roussel, Vogel, CHI 2012). Constants are from
-MediaPipe 0.10.21. The networks run in this process, in one thread, without Python's lock.
+MediaPipe 0.10.21. The networks run in this process, in one thread, without holding Python's global
+lock.
 """
 
 from __future__ import annotations
@@ -37,20 +38,20 @@ if TYPE_CHECKING:
 
 SCHEME = 'mediapipe33'
 LANDMARKS = 33
-# Interval without images after which the whole image is searched again, ns.
+# Gap between images after which the whole image is searched again, ns.
 _MAX_INTERVAL = 1_000_000_000
-# Sides of the inputs of the networks, px, and of the heat maps of landmarks.
+# Side lengths of the two networks' inputs, and of the heat maps of landmarks, px.
 _PERSON_SIZE, _LANDMARK_SIZE, _HEAT_SIZE = 224, 256, 64
 # Cell sizes of the first network, px, predictions per cell, and overlap (intersection over union)
 # above which two predictions are merged.
 _STRIDES, _PREDICTIONS_PER_CELL, _SAME_OVERLAP = (8, 16, 32), (2, 2, 6), 0.3
 # Minimum probability of a person, and minimum probability that a pixel belongs to the person.
 _MIN_PROBABILITY = 0.5
-# Factor on the quality of a person who lies or is upside down.
+# Factor on the quality of a person who is lying or upside down.
 _LYING_QUALITY = 0.6
 # Half side of the window around a landmark in its heat map, cells, and minimum peak in this window.
 _HEAT_REACH, _MIN_HEAT_PEAK = 4, 0.5
-# Cutoffs f_0 of the one-euro filters, Hz, and factors b with which velocities raise them.
+# Cutoffs f_0 of the one-euro filters, Hz, and factors b by which velocities raise the cutoffs.
 _VELOCITY_CUTOFF = 1.0
 _LANDMARK_CUTOFF, _CIRCLE_CUTOFF, _POSITION_CUTOFF = (0.05, 80.0), (0.01, 10.0), (0.1, 40.0)
 # Weight of a new image in the smoothed visibility.
@@ -113,14 +114,14 @@ class BlazePose:
         return self._followed.smooth(found, interval * 1e-9)
 
     def _circle(self, image: Image) -> Array | None:
-        """Centre and a point (2, 2) of the circle around the best-scored person, px; or None."""
+        """Circle (centre and a point, (2, 2), px) around the person of highest score, or None."""
         height, width = image.shape[:2]
         whole = Square((width / 2, height / 2), max(height, width), 0.0)
         return next((circle for _, circle in self._networks.circles(image, whole)), None)
 
 
 class Networks:
-    """The two networks, which find people in a square of an image, and landmarks of one person.
+    """The two networks: one finds people in a square of an image, the other a person's landmarks.
 
     Raises:
         DetectorError: the networks are not installed.
@@ -134,7 +135,7 @@ class Networks:
     def circles(self, image: Image, square: Square) -> Iterator[tuple[float, Array]]:
         """Yields score and circle (centre and a point, (2, 2), px) of people, highest score first.
 
-        Predictions that overlap with the best remaining one are averaged with it.
+        Each prediction is averaged with the predictions of lower score that overlap with it.
         """
         seen = square.seen(image, _PERSON_SIZE, cv2.BORDER_CONSTANT)
         boxes, logits = self._person(seen * np.float32(2 / 255) - np.float32(1))
@@ -157,7 +158,7 @@ class Networks:
             points, scores = points[~same], scores[~same]
 
     def landmarks(self, image: Image, square: Square) -> Found | None:
-        """The landmarks of the person in a square; None if it shows nobody."""
+        """The landmarks of the person in a square; None if the square shows nobody."""
         if square.side < 1.0:
             return None
         seen = square.seen(image, _LANDMARK_SIZE, cv2.BORDER_REPLICATE)
@@ -188,11 +189,11 @@ class Found:
     """The output of the second network for one image.
 
     Attributes:
-        square: square of the image that the network saw.
+        square: square of the image that was the network's input.
         points: (35, 2) landmarks, then centre and point of the circle, px.
         visibilities: (33,) visibilities of the landmarks, 0 to 1.
         positions: (33, 3) 3D positions of the landmarks, m.
-        mask: (256, 256) logits of the pixels of the person in the square.
+        mask: (256, 256) logits that a pixel of the square belongs to the person.
         presence: probability that the square shows a person.
     """
 
@@ -205,7 +206,7 @@ class Found:
 
     @property
     def quality(self) -> float:
-        """Presence times mean visibility, 0 to 1; reduced for a person who is not upright."""
+        """Presence times mean visibility, 0 to 1; lower for a person who is not upright."""
         upright = max(float(elementary.cos(self.square.angle)), 0.0)
         share = _LYING_QUALITY + (1.0 - _LYING_QUALITY) * upright
         return self.presence * float(self.visibilities.mean()) * share
@@ -226,7 +227,7 @@ class Followed:
         self._of_positions = _OneEuroFilter(*_POSITION_CUTOFF)
 
     def smooth(self, found: Found, interval: float) -> Keypoints:
-        """Smooths the output for an image that is `interval` s newer than the previous one."""
+        """Smooths the output for an image `interval` s after the previous image."""
         landmarks, circle = found.points[:LANDMARKS], found.points[LANDMARKS:]
         diameter = max(2 * math.hypot(*(circle[1] - circle[0])), 1.0)
         self.circle = self._of_circle(circle, interval, diameter)
@@ -244,14 +245,14 @@ class Followed:
 
 
 class _OneEuroFilter:
-    """Smooths an array, fast-changing values less; see the head of the module."""
+    """One-euro filter of an array, which smooths fast changes less; see the module's docstring."""
 
     def __init__(self, cutoff: float, gain: float) -> None:
         self._cutoff, self._gain = cutoff, gain
         self._last: Array | None = None
 
     def __call__(self, values: Array, interval: float, scale: float) -> Array:
-        """Smooths the next values; `scale` is the unit of length of velocities."""
+        """Smooths the next values; `scale` is the length unit in which velocities are measured."""
         if self._last is None:
             self._smoothed, self._velocity = values, np.zeros_like(values)
         else:
@@ -265,7 +266,7 @@ class _OneEuroFilter:
 
 
 class _Network:
-    """A network that is read from a file and runs in one thread."""
+    """A neural network, read from a file, that runs in one thread."""
 
     def __init__(self, name: str) -> None:
         content = blazepose_models.require_network(name)
@@ -283,7 +284,7 @@ class _Network:
 
 
 def _anchors() -> Array:
-    """Cell centres (2254, 2) of the first network's predictions, as fractions of its image."""
+    """Cell centres (2254, 2) of the first network's predictions, as fractions of its input."""
     result = []
     for stride, predictions in zip(_STRIDES, _PREDICTIONS_PER_CELL):
         middles = (np.arange(_PERSON_SIZE // stride) + 0.5) * stride / _PERSON_SIZE
@@ -293,7 +294,7 @@ def _anchors() -> Array:
 
 
 def _refined(points: Array, heat: _Tensor) -> Array:
-    """Moves points (n, 2), fractions of the image, to the mean of the heat around them.
+    """Moves points (n, 2), fractions of the image, to the mean of the heat map around each point.
 
     Args:
         heat: (64, 64, n) logits of heat maps.

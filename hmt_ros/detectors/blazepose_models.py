@@ -1,6 +1,6 @@
 """The networks of MediaPipe Pose, two files of MediaPipe's wheel under the Apache licence.
 
-`install` extracts them from the wheel; MediaPipe itself, which needs numpy below 2, is not
+`install` extracts the networks from the wheel. MediaPipe itself, which needs numpy below 2, is not
 installed.
 """
 
@@ -15,7 +15,7 @@ from pathlib import Path
 from hmt_ros.detectors.detector import DetectorError
 from hmt_ros.detectors.network_files import NetworkFiles, run_installer
 
-# Package that runs the networks, and its module.
+# Package that runs the networks, and the module to import.
 RUNTIME, RUNTIME_MODULE = 'ai-edge-litert', 'ai_edge_litert'
 PERSON = 'pose_detection.tflite'
 LANDMARKS = 'pose_landmark_full.tflite'
@@ -29,7 +29,8 @@ FILES = NetworkFiles(
     },
 )
 
-# Options of pip for a fixed wheel, on any platform; all wheels contain the same networks.
+# Options of pip that select one fixed wheel on every platform; all wheels contain the same
+# networks.
 _ANY_WHEEL = (
     *('--no-deps', '--only-binary=:all:', '--platform=manylinux_2_28_x86_64'),
     *('--python-version=3.12', '--implementation=cp', '--abi=cp312'),
@@ -42,7 +43,7 @@ def has_networks() -> bool:
 
 
 def has_runtime() -> bool:
-    """Whether this Python has the package that runs the networks."""
+    """Whether the package that runs the networks is installed in this Python environment."""
     return importlib.util.find_spec(RUNTIME_MODULE) is not None
 
 
@@ -71,7 +72,7 @@ def install() -> None:
     """Installs LiteRT with pip, and extracts the networks from the wheel of MediaPipe.
 
     Raises:
-        ValueError: pip fails, or the wheel contains other files; the message is one line.
+        ValueError: pip fails, or the wheel contains unexpected files; the message is one line.
     """
     if not has_runtime():
         _pip('install', RUNTIME)

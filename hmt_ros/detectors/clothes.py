@@ -1,8 +1,9 @@
 """The colours of a person's clothes, on torso and legs, which distinguish people.
 
-The torso is the quadrangle between shoulders and hips; the legs are lines through their landmarks,
-as wide as a fraction of the length of the trunk. The colours of a part are a histogram; the
-distance of two histograms is the squared Hellinger distance 1 - sum sqrt(p q), from 0 to 1.
+The torso is the quadrangle between shoulders and hips. The legs are lines through the landmarks of
+hips, knees and ankles; their width is a fraction of the trunk's length. The colours of a part are a
+histogram; the distance between two histograms is the squared Hellinger distance 1 - sum sqrt(p q),
+from 0 to 1.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ TORSO = ('left_shoulder', 'right_shoulder', 'right_hip', 'left_hip')
 LEGS = (('left_hip', 'left_knee', 'left_ankle'), ('right_hip', 'right_knee', 'right_ankle'))
 # Minimum number of pixels of a part, and width of a leg as a fraction of the length of the trunk.
 MIN_PIXELS, LEG_WIDTH_RATIO = 40, 0.22
-# Minimum visibility of a landmark that is used, and maximum side of the image of a person, px.
+# Minimum visibility of landmarks, and side length, px, to which larger crops of a person are
+# reduced.
 MIN_VISIBILITY, MAX_IMAGE_SIDE = 0.5, 96
 
 
@@ -66,12 +68,12 @@ class Clothes:
         return cls(np.where(sizes >= MIN_PIXELS, counts[1:] / np.maximum(sizes, 1), np.nan))
 
     def distance(self, other: Clothes) -> float:
-        """Mean distance over the parts that both have, 0 to 1; NaN if they share no part."""
+        """Mean distance over the parts seen on both people, 0 to 1; NaN without such parts."""
         each = 1.0 - np.sqrt(self.shares * other.shares).sum(1)
         return float(np.nanmean(each)) if np.isfinite(each).any() else np.nan
 
     def mixed(self, other: Clothes, share: float) -> Clothes:
-        """Mixes these colours with a share of others; a part missing in one is copied."""
+        """Mixes in a share of other clothes; a part seen on only one of the two is copied."""
         mixed = self.shares + share * (other.shares - self.shares)
         known = np.where(np.isnan(self.shares), other.shares, self.shares)
         return Clothes(np.where(np.isnan(mixed), known, mixed))

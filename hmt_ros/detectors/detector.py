@@ -15,19 +15,19 @@ from hmt_ros.inference.arrays import Image, Mask
 
 
 class DetectorError(ValueError):
-    """The detector is not installed; the message, of one line, says what to run."""
+    """The detector is not installed; the message is one line with the command to run."""
 
 
 class Detector(Protocol):
     """Finds the keypoints of one person in successive images.
 
-    A detector may follow the person through a sequence of images, and has no other state. It is
+    The only state of a detector is the tracking of the person through a sequence of images. It is
     deterministic: the same images with the same stamps give the same output. It draws no random
     numbers and reads no clock.
 
     Attributes:
         mask: (H, W) pixels of the person in the last image; None if no mask was requested or the
-            detector does not make masks.
+            detector makes none.
     """
 
     mask: Mask | None
@@ -35,31 +35,32 @@ class Detector(Protocol):
     def detect(self, image: Image, stamp_ns: int) -> Keypoints | None:
         """The keypoints of the person in an image.
 
-        An image that is not newer than the previous one, or differs in size, starts a new sequence.
+        An image starts a new sequence if it is not newer than the previous image, or differs in
+        size.
 
         Args:
             image: (H, W, 3) BGR, with square pixels.
             stamp_ns: stamp of the image.
 
         Returns:
-            Landmarks with names of a scheme of `keypoint_schemes.yaml`, pixels with (0, 0) at the
-            centre of the first pixel, covariances in px^2 (NaN where unknown), confidences from 0
-            to 1, and, if the detector estimates them, 3D `positions` in m along the axes of the
-            camera. None if nobody was seen.
+            Landmarks named as in a scheme of `keypoint_schemes.yaml`; pixels, where (0, 0) is the
+            centre of the first pixel; covariances in px^2, NaN where unknown; confidences from 0 to
+            1; 3D `positions` in m along the axes of the camera, if estimated. None if nobody was
+            seen.
         """
         ...
 
 
 @dataclass(frozen=True)
 class DetectorKind:
-    """A detector that can be chosen by its name in `registry.DETECTORS`.
+    """A kind of detector, which users select by name in `registry.DETECTORS`.
 
     Attributes:
         title: name of the detector, for users.
-        make: `make(with_mask=...)` makes a detector that has seen no image; `with_mask` says
-            whether to compute `mask`. Raises DetectorError if the detector is not installed.
+        make: `make(with_mask=...)` makes a new detector; `with_mask`: whether to compute `mask`.
+            Raises DetectorError if the detector is not installed.
         is_installed: whether the detector can run here.
-        install: installs missing files; raises ValueError with a message of one line if it fails.
+        install: installs missing files; raises ValueError with a one-line message if this fails.
     """
 
     title: str

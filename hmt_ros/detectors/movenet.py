@@ -1,17 +1,17 @@
 """Mean of MoveNet Thunder and BlazePose: two detectors of the same person in each image.
 
-BlazePose finds the person. MoveNet sees the square around BlazePose's landmarks, clipped to the
-image, and estimates shoulders, elbows, wrists, hips, knees and ankles again. The errors, 10 px of
-BlazePose and 8 px of MoveNet, vary over a clip and have a correlation of 0.4, so the best mean
-gives MoveNet twice the weight. If the two differ by a vector d, px, the covariance of the mean is
-s^2 1 + d d' / 4, where s is the standard deviation for BlazePose's confidence. All other output is
-from BlazePose.
+BlazePose finds the person. MoveNet then estimates shoulders, elbows, wrists, hips, knees and ankles
+again, from the square around BlazePose's landmarks, clipped to the image. The errors (BlazePose: 10
+px, MoveNet: 8 px) vary over a clip and have a correlation of 0.4, so the best mean gives MoveNet
+twice the weight of BlazePose. If the two differ by a vector d, px, the covariance of the mean is
+s^2 1 + d d' / 4, where s is the standard deviation that belongs to BlazePose's confidence. All
+other output is from BlazePose.
 
 MoveNet has four heads of 64 x 64 cells: probabilities of the centre of a person, probabilities of
 the landmarks, vectors from a centre to the landmarks, and offsets of the landmarks from their
-cells. The centre is the cell with the largest probability, weighted less near the border. The
-centre predicts the places of the landmarks; a landmark is in the cell with the largest ratio of
-probability to distance from the predicted place.
+cells. The centre is the most probable cell; cells near the border have lower weights. The centre
+predicts the places of the landmarks; each landmark is in the cell with the largest ratio of its
+probability to the distance from the predicted place.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image, Mask
 
 SCHEME = 'coco17'
-# Offset added to the distance of a cell from the expected place of a landmark, cells.
+# Offset added to the distance between a cell and a landmark's predicted place, cells.
 _DISTANCE_OFFSET = 1.8
-# MoveNet's share in the mean, and minimum score of a landmark that is used.
+# MoveNet's weight in the mean, and minimum score of a landmark to be used.
 _MEAN_WEIGHT, _MIN_SCORE = 2 / 3, 0.3
-# Index of the first of MoveNet's landmarks that is not in the face.
+# Index of MoveNet's first landmark outside the face.
 _FIRST_BODY_LANDMARK = 5
 
 
@@ -69,7 +69,7 @@ def chosen(
 
     Args:
         heat: (n, 64, 64) probabilities of landmarks.
-        centre: (64, 64) weighted probability of a centre.
+        centre: (64, 64) weighted probability that a person's centre is in each cell.
         ways: (2 n, 64, 64) vectors (row, column) from a centre to the landmarks, cells.
         offsets: (2 n, 64, 64) vectors (row, column) from a cell to its landmark, cells.
     """
@@ -117,11 +117,11 @@ class BlazePoseAndMoveNet:
 
 
 def together(found: Keypoints, rows: NDArray[np.intp], pixels: Array) -> Keypoints:
-    """Averages some keypoints with those of a second detector.
+    """Averages some keypoints of one detector with the keypoints of a second detector.
 
     Args:
         found: keypoints of the first detector.
-        rows: (m,) indices of the keypoints that the second detector found, too.
+        rows: (m,) indices of the keypoints that the second detector found as well.
         pixels: (m, 2) pixels of these keypoints from the second detector.
     """
     apart = pixels - found.pixels[rows]

@@ -1,9 +1,10 @@
 """Translates MoveNet from a graph of TensorFlow.js to ONNX, which OpenCV reads.
 
 The translated graph starts at the scaled image and ends at the convolutions of the four heads; the
-choice of cells, which is also in the original graph, is in `movenet`. There are few operations:
-convolutions fused with bias and activation, sums, and enlargement by a factor of two. Messages are
-encoded as protocol buffers: a field is its number and type, then its value or length and value.
+selection of cells, which the original graph contains as well, is done in `movenet`. The graph has
+few kinds of operations: convolutions fused with bias and activation, sums, and enlargement by a
+factor of two. Messages are encoded as protocol buffers: a field consists of its number and type,
+then its value, preceded by the length if this varies.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Names of the scaled image and of the heads in the graph; numbers of channels of the heads.
+# Names of the scaled image and of the heads in the graph; number of channels of each head.
 _ROOT = 'StatefulPartitionedCall/'
 _INPUT, SIZE = _ROOT + 'sub_1', 256
 _HEADS = {
@@ -30,7 +31,7 @@ HEADS = tuple(f'{_ROOT}{head}/BiasAdd' for head in _HEADS)
 CELLS = 64
 _CENTRES = 'ConstantFolding/StatefulPartitionedCall/truediv_2_recip'
 _CONVOLUTIONS = ('_FusedConv2D', 'FusedDepthwiseConv2dNative', 'DepthwiseConv2dNative')
-# In later operation sets of ONNX the bounds of Clip are inputs, which OpenCV 4.6 does not support.
+# Later operation sets of ONNX make the bounds of Clip inputs; OpenCV 4.6 does not support this.
 _IR_VERSION, _OPERATION_SET = 5, 10
 _TYPES = {'float32': '<f4', 'int32': '<i4'}
 _FLOATS = 1
@@ -40,7 +41,7 @@ _Weights = dict[str, _Tensor]
 
 
 def translated(graph: bytes, weights: bytes) -> tuple[bytes, NDArray[np.float32]]:
-    """The network in ONNX, and factors (64, 64) on the probability of a centre in each cell.
+    """The network in ONNX, and factors (64, 64) on the probability of a person's centre per cell.
 
     The network maps the scaled image (1, 3, 256, 256) to the heads (1, C, 64, 64).
 
@@ -97,7 +98,7 @@ def _convolution(node: Any, tensors: _Weights) -> list[bytes]:
     name, attributes, inputs = node['name'], node['attr'], node['input']
     kernel, each = tensors[inputs[1]], 'Depthwise' in node['op']
     stride, size = int(attributes['strides']['list']['i'][1]), len(kernel)
-    # Padding 'SAME' for images of even sides; if it is odd, the end gets one pixel more.
+    # Padding 'SAME' for images of even sides; an odd padding has one pixel more at the end.
     around = max(size - stride, 0) if _text(attributes['padding']['s']) == 'SAME' else 0
     pads = [around // 2, around // 2, around - around // 2, around - around // 2]
     kernel = kernel.transpose((2, 3, 0, 1) if each else (3, 2, 0, 1))
@@ -162,7 +163,7 @@ def _message(field: int, value: int | str | bytes) -> bytes:
 
 
 def _number(value: int) -> bytes:
-    """A varint: seven bits per byte, lowest first; all bytes but the last have bit eight set."""
+    """A varint: seven bits per byte, lowest first; all but the last byte have bit eight set."""
     result = bytearray()
     while value > 127:
         result.append(value & 127 | 128)

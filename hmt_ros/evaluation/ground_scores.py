@@ -1,8 +1,8 @@
-"""Scores of feet (sliding, and depth below the true floor), and of the estimated vertical.
+"""Scores of the feet (sliding, and depth below the true floor) and of the estimated vertical.
 
 The sliding of a foot is the speed of its ankle in the world between two frames in which the foot
-truly stands. Depth is measured from the true plane of the floor to ankles and toes. The sole lies
-some centimetres below the ankle, so that a pose that does not sink in has a depth of 0.
+truly stands. The depth is the distance of ankles and toes below the true plane of the floor. The
+sole lies some centimetres below the ankle, so the depth of a pose is 0 unless it sinks in.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hmt_ros.inference.arrays import Array
 
 ANKLES = ('left_ankle', 'right_ankle')
 FEET = (*ANKLES, 'left_toe', 'right_toe')
-# Maximum depth below the floor at which a joint does not count as sunk, m.
+# Depth below the floor beyond which a joint counts as sunk, m.
 MAX_SINKING = 0.02
 # Maximum interval between neighbouring frames, relative to the median interval.
 _MAX_GAP_RATIO = 1.5
@@ -30,7 +30,7 @@ class TrueGround:
     Attributes:
         up: (3,) unit vector against gravity, camera frame.
         height: height of the camera above the floor, m.
-        standing: (2,) whether the left and the right foot stand; None: unknown.
+        standing: (2,) whether the left and the right foot rest on the floor; None: unknown.
         camera_rotation: (3, 3) rotation from the camera to a stationary world frame.
         camera_position: (3,) position of the camera in the world frame, m.
     """
@@ -48,8 +48,9 @@ class GroundScores:
 
     Attributes:
         sliding: mean speed of standing ankles, m/s; None if no foot is known to stand.
-        depth: mean depth of ankles and toes below the floor, m; joints above count as 0.
-        sunk: fraction of the frames in which an ankle or a toe is deeper than `MAX_SINKING`.
+        depth: mean depth of ankles and toes below the floor, m; 0 for joints above the floor.
+        sunk: fraction of the frames in which an ankle or a toe is more than `MAX_SINKING` below the
+            floor.
         frames: number of frames.
     """
 
@@ -77,12 +78,12 @@ class GroundScores:
 
 @dataclass(frozen=True)
 class GravityScores:
-    """Scores of the vertical that a track estimates.
+    """Scores of the vertical estimated by a track.
 
     Attributes:
         error: median angle to the true vertical, rad.
-        said: median of the standard deviation that the track reports for the vertical, about a
-            horizontal axis, rad; NaN: not reported.
+        said: median of the reported standard deviation of the vertical, about a horizontal axis,
+            rad; NaN: not reported.
         frames: number of frames.
     """
 
@@ -127,7 +128,7 @@ def gravity_scores(
 def ground_scores(
     joints: Mapping[int, Array], names: Sequence[str], truth: Mapping[int, TrueGround]
 ) -> GroundScores | None:
-    """Score the feet; return None without a frame with a true floor, or without joints of feet.
+    """Score the feet; return None if no frame has a true floor, or there are no joints of feet.
 
     Args:
         joints: stamp in ns -> (J, 3) joint positions of one pose, m, camera frame.

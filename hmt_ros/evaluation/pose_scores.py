@@ -1,16 +1,17 @@
 """Errors and calibration of mixtures over poses, against the true joint positions.
 
-Joint positions relative to an origin are compared, so that bodies with different degrees of freedom
-have comparable scores. The origin is the pelvis, or the centre of the hips if the truth has no
-pelvis. A component N(m, S) over poses becomes one over joint positions by linearisation,
+Scores compare joint positions relative to an origin, so that scores of bodies with different
+degrees of freedom are comparable. The origin is the pelvis, or the centre of the hips if the truth
+has no pelvis. By linearisation, a component N(m, S) over poses becomes the following component over
+joint positions:
 
     N(f(m), J S J^T + D + s^2 I),   f: joints minus origin,   J = df/dx at m.
 
-The diagonal matrix D has the variances of errors that remain in every pose, as the joints of the
-body are not exactly those of the person (`Body.joint_errors`); published covariances of joints
-include D, too. Without D the density would be confined to a surface, because the 39 coordinates of
-13 joints depend on fewer degrees of freedom. s is an additional standard deviation for evaluation,
-usually 0.
+The diagonal matrix D contains the variances of errors that remain in every pose, because the joints
+of the body model are not exactly the person's (`Body.joint_errors`). Published covariances of
+joints include D as well. Without D the density would be confined to a surface, because the 39
+coordinates of 13 joints depend on fewer degrees of freedom. s is an additional standard deviation
+for evaluation, usually 0.
 """
 
 from __future__ import annotations
@@ -52,9 +53,9 @@ ORIGIN = 'pelvis'
 HIPS = ('left_hip', 'right_hip')
 # Additional standard deviation of a coordinate (s above), m.
 MODEL_SIGMA = 0.0
-# Minimum mean joint error of the best component at which a frame counts as lost, m.
+# Mean joint error of the best component at or above which a frame counts as lost, m.
 LOST_ERROR = 0.15
-# Number of samples of a density from which a level is estimated.
+# Number of samples used to estimate a level.
 LEVEL_SAMPLES = 500
 # Number of mixtures whose kinematics are computed together.
 BATCH_SIZE = 32
@@ -65,7 +66,7 @@ def origin_joints(names: Sequence[str], source: str = 'truth') -> tuple[str, ...
 
     Args:
         names: names of the joints whose true positions are known.
-        source: name of the source of the positions, for the error.
+        source: name of the source of the positions, for the error message.
 
     Raises:
         ValueError: neither the pelvis nor both hips are known.
@@ -154,12 +155,13 @@ def joint_mixtures(
         names: (J,) names of the joints.
         model_sigma: additional standard deviation of a coordinate, m.
         positions: (K, J', 3) positions, m, of all joints of the body at the means of each mixture;
-            None: computed from the means.
-        origin: joints whose mean position is the origin; empty: origin of the camera frame.
+            None: computed by this function.
+        origin: joints whose mean position is the origin; empty: the origin of the camera frame is
+            used.
 
     Raises:
         KeyError: the body does not have a joint.
-        ValueError: a mixture is over poses of another body.
+        ValueError: a mixture is over poses of a different body.
     """
     which = body.skeleton.joint_index([*names])
 
@@ -172,7 +174,7 @@ def joint_mixtures(
 
     own = np.diag(np.repeat(np.square(body.joint_errors[which]) + model_sigma**2, 3))
     result = []
-    # Kinematics are computed in batches, ten times as fast as frame by frame.
+    # Kinematics in batches are ten times as fast as frame by frame.
     for first in range(0, len(mixtures), BATCH_SIZE):
         batch = mixtures[first : first + BATCH_SIZE]
         means = np.concatenate([mixture.means for mixture in batch])
@@ -203,12 +205,12 @@ class Scores:
         modes: (T,) number of components.
         perplexity: (T,) exp of the entropy of the weights: the effective number of components.
         log_densities: (T,) log p(true joint positions), positions in m; None without covariances.
-        levels: (T,) levels of the true positions of all joints together, see
+        levels: (T,) levels of the true positions, all joints taken together, see
             `inference.calibration`; None without covariances.
-        joint_levels: (T, J) levels of the true position of each joint by itself; None without
-            covariances.
-        absolute_levels: (T, J) levels of the true position of each joint by itself in the frame of
-            the camera; None if unknown.
+        joint_levels: (T, J) levels of each joint's true position under its marginal density; None
+            without covariances.
+        absolute_levels: (T, J) levels of each joint's true position in the camera frame; None if
+            unknown.
     """
 
     names: tuple[str, ...]
@@ -227,7 +229,7 @@ class Scores:
 
     @staticmethod
     def concatenate(parts: Sequence[Scores]) -> Scores:
-        """Concatenate scores of consecutive parts; a field is None if it is None in any part."""
+        """Concatenate scores of consecutive frames; a field is None if it is None in any part."""
 
         def joined(name: str) -> Any:
             values = [getattr(part, name) for part in parts]
@@ -237,12 +239,12 @@ class Scores:
 
     @staticmethod
     def of_nobody(names: Sequence[str], frames: int = 0) -> Scores:
-        """Return scores of frames without an estimate: NaN."""
+        """Return scores for frames without an estimate; all are NaN."""
         errors, each = np.full((frames, len(names)), np.nan), np.full(frames, np.nan)
         return Scores(tuple(names), errors, errors, errors, each, each, None, None, None)
 
     def summary(self) -> dict[str, Any]:
-        """Return means over the frames, errors in mm; scores that need covariances may be None.
+        """Return means over the frames, errors in mm; densities and coverages are None if unknown.
 
         Without frames the means are NaN.
         """
@@ -313,7 +315,7 @@ def marginal_regions(
 
     Returns:
         Levels (T, J) of the true positions, see `Scores`; volumes (T, J) of the 90 % regions, m^3:
-        the mean of 1 / p over samples of p, where samples outside the region count as 0.
+        the mean of 1 / p over samples of p, with 0 for samples outside the region.
 
     Raises:
         ValueError: a mixture has no covariances.

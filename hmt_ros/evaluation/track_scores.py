@@ -28,9 +28,9 @@ from hmt_ros.evaluation.pose_scores import (
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.mixture import GaussianMixture
 
-# Minimum number of evaluated joints that a truth must have.
+# Minimum number of evaluated joints in the ground truth.
 _MIN_JOINTS = 4
-# Maximum distance at which recorded joint positions agree with the kinematics of a body, m.
+# Distance above which recorded joint positions contradict the kinematics of a body, m.
 _POSITION_TOLERANCE = 1e-3
 
 
@@ -39,7 +39,7 @@ class Truth:
     """True positions of the joints of a person.
 
     Attributes:
-        source: name of the source, for texts of errors.
+        source: name of the source, for error messages.
         joint_names: (J,) names of the joints.
         joints: stamp in ns -> (J, 3) m, camera optical frame.
         frame_id: frame of the positions; '' if unknown.
@@ -85,7 +85,7 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A mixture over poses at one time, or those parts of the mixture that are known.
+    """A mixture over poses at one time; some parts may be unknown.
 
     Attributes:
         stamp_ns: time of the poses, ns.
@@ -109,12 +109,12 @@ class TrackScores:
     """Scores of a track.
 
     Attributes:
-        kind: kind of its mixtures, e.g. 'posterior'.
+        kind: kind of the mixtures, e.g. 'posterior'.
         scores: scores of the frames with ground truth.
         missing: number of frames of the ground truth without an estimate.
         without_truth: number of estimates at stamps without ground truth.
-        note: reason for missing densities; '' if none are missing.
-        ground: scores of the feet of the heaviest mode against the true floor; None if unknown.
+        note: reason why densities are missing; '' if they are not.
+        ground: scores of the heaviest mode's feet against the true floor; None if unknown.
     """
 
     kind: str
@@ -155,7 +155,7 @@ class TrackScorer:
         self._names: tuple[str, ...] = ()
 
     def take(self, estimate: Estimate) -> None:
-        """Adds a final estimate; only the first estimate of each stamp is used.
+        """Adds a final estimate; later estimates with the same stamp are ignored.
 
         Raises:
             ValueError: the estimate lacks joints of the truth.
@@ -175,7 +175,7 @@ class TrackScorer:
             self._score_waiting()
 
     def take_window(self, estimates: Sequence[Estimate]) -> None:
-        """Adds the estimates of a window, oldest first; estimates before the window become final.
+        """Adds the estimates of a window, oldest first; earlier estimates become final.
 
         Raises:
             ValueError: see `take`.
@@ -189,7 +189,7 @@ class TrackScorer:
         """Return all scores.
 
         Raises:
-            ValueError: no estimate has a stamp of the ground truth; see also `take`.
+            ValueError: no stamp of an estimate is in the ground truth; see also `take`.
         """
         for stamp in sorted(self._window):
             self.take(self._window[stamp])
@@ -274,7 +274,7 @@ class TrackScorer:
 
 
 def _is_elsewhere(body: Body, estimate: Estimate) -> bool:
-    """Whether recorded joint positions differ from the kinematics of the body."""
+    """Whether recorded joint positions contradict the kinematics of the body."""
     if estimate.positions is None or estimate.mixture is None:
         return False
     if estimate.joint_names != body.joint_names:
@@ -286,14 +286,15 @@ def _is_elsewhere(body: Body, estimate: Estimate) -> bool:
 def mode_errors(
     joints: Mapping[int, Array], names: Sequence[str], truth: Truth
 ) -> dict[int, Array]:
-    """Compute the mean joint error (K,) of each mode, m, by stamp in ns, if the truth is known.
+    """Compute the mean joint error (K,) of the modes, m, for each stamp with known truth.
 
     Args:
         joints: stamp in ns -> (K, J, 3) joint positions of the modes, m.
         names: (J,) names of the joints.
 
     Returns:
-        The errors by stamp; empty if modes and truth share no evaluated joint, or no origin.
+        The errors by stamp, ns; empty if modes and truth share no evaluated joint or no origin
+        joints.
     """
     shared = [x for x in EVALUATED_JOINTS if x in truth.joint_names and x in names]
     origin = origin_joints(truth.joint_names, truth.source)

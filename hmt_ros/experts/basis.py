@@ -1,7 +1,7 @@
 """Basis functions phi(r) of the experts and gates: linear, or Gaussian kernels (BME 2.2).
 
-Both standardise the inputs, so callers use the units of the data. In both, the first function is
-the constant 1.
+Both standardise the inputs, so callers pass inputs in the units of the data. In both, the first
+function is the constant 1.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class RadialBasis:
         )
 
     def subset(self, kernels: NDArray[np.intp]) -> RadialBasis:
-        """The basis with the constant and some of the K kernels."""
+        """Return the basis with the constant and only some of the K kernels."""
         return RadialBasis(self.standardisation, self.centres[kernels], self.width)
 
     def arrays(self) -> Arrays:

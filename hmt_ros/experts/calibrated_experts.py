@@ -57,7 +57,7 @@ class Calibration:
             require(1.0 <= getattr(self, name) <= MAX_POSITIVE, f'{name} must be at least 1')
 
     def of(self, found: Components) -> Components:
-        """The calibrated mixtures."""
+        """Apply the calibration to mixtures."""
         return replace(
             found,
             log_weights=log_softmax(found.log_weights / self.temperature),
@@ -99,7 +99,7 @@ class CalibratedExperts(ConditionalDensity):
     @classmethod
     def _constructed(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
         own = part('model', arrays)
-        # Refuse nesting, because a file could nest models without end.
+        # Refuse nesting, because a file could nest models endlessly.
         require(str(own['kind']) != cls.kind, 'a calibrated model inside a calibrated model')
         return cls(stored_model(own), **parameters_of(arrays))
 

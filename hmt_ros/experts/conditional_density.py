@@ -3,8 +3,8 @@
     p(x | r) = sum_i g_i(r) p_i(x | r)                                              (BME 10)
     p_i(x | r) = N(x; f_i(r), c_i(r) O_i)                                           (BME 12)
 
-with gates g_i that are positive and sum to 1. The scalar c_i(r) >= 1 inflates the noise O_i of an
-expert by the uncertainty of its weights at the input r; in the paper it is 1.
+The gates g_i are positive and sum to 1. The scalar c_i(r) >= 1 inflates the noise O_i of an expert
+by the uncertainty of its weights at the input r; in the paper c_i is 1.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Components:
     noise: Array
 
     def log_density(self, targets: Array) -> Array:
-        """log p(x | r), (n,), of one target per input, (n, D)."""
+        """log p(x | r), (n,), for targets (n, D), one for each input."""
         return np.asarray(
             log_sum_exp(self.log_weights + self.component_log_densities(targets), axis=1)
         )
@@ -82,11 +82,11 @@ class Components:
 class ConditionalDensity(ABC):
     """A model of p(x | r) with inputs r (p,) and targets x (D,).
 
-    The conventions are those of scikit-learn's estimators: the constructor stores its arguments
+    Follows the conventions of scikit-learn estimators: the constructor stores its arguments
     unchanged, learned attributes end in an underscore, `get_params` and `set_params` exist.
 
     Attributes:
-        kinds: Classes of models by their names in files.
+        kinds: Mapping from the name of a model in files to its class.
     """
 
     kind: ClassVar[str]
@@ -123,7 +123,8 @@ class ConditionalDensity(ABC):
     def support(self, inputs: ArrayLike) -> Array:
         """Similarity (n,) of inputs (n, p) to the training data, from 0 to 1.
 
-        It is the largest kernel value at the input. Near 0 the means are no better than a constant.
+        It is the largest kernel value at the input. If it is near 0, the means are no better than a
+        constant.
         """
 
     @abstractmethod
@@ -226,7 +227,8 @@ class ConditionalDensity(ABC):
 
         Raises:
             FileNotFoundError: the file does not exist.
-            ValueError: the file is not a model, has another version or kind, or is invalid.
+            ValueError: the file is not a model, has an unsupported version or a different kind, or
+                is invalid.
         """
         return read_model(path, cls.kind, cls.from_arrays)
 
@@ -276,7 +278,7 @@ class ConditionalDensity(ABC):
 
 
 def stored_model(arrays: Mapping[str, NDArray[Any]]) -> ConditionalDensity:
-    """Build the model that `ConditionalDensity.to_arrays` stored, of the kind in the arrays.
+    """Build the model that `ConditionalDensity.to_arrays` stored; the arrays name its class.
 
     Raises:
         ValueError, KeyError, TypeError, IndexError: the kind is unknown, or arrays are missing or

@@ -1,6 +1,7 @@
-"""Discriminative density propagation: mixtures through conditional densities (BME 2.1).
+"""Discriminative density propagation of mixtures by conditional densities (BME 2.1).
 
-Rule (1) needs a model of p(x_t | x_{t-1}, r_t), whose input is the state, then the observation:
+Rule (1) needs a model of p(x_t | x_{t-1}, r_t), whose input is the previous state followed by the
+observation:
 
     p(x_t | R_t) = integral p(x_t | x_{t-1}, r_t) p(x_{t-1} | R_{t-1}) dx_{t-1}         (BME 1)
 
@@ -39,8 +40,8 @@ def propagate(
 ) -> GaussianMixture:
     """Compute p(x_t | R_t) by rule (1).
 
-    Previous components at which the model has no training data pass their weight to the prediction
-    from the observation alone.
+    The weight of previous components that are unlike the training data goes to the prediction from
+    the observation alone.
 
     Args:
         model: Model of p(x_t | x_{t-1}, r_t) with inputs (x_{t-1}, r_t), states first.

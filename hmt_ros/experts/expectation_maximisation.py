@@ -10,7 +10,8 @@ weights. The E-step takes an expectation over the weights W of the experts,
 
     h_ni ~ g_i(r_n) exp E_W log N(x_n; W_i' phi, O_i)                               (BME 13)
 
-which lowers the logarithm by D/2 phi' S_i phi. The M-steps raise E_i and G.
+The expectation is D/2 phi' S_i phi below the logarithm at the mean weights. The M-steps raise E_i
+and G.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ def e_step(features: TrainingPairs, state: EMState) -> Array:
 
 
 def m_step(features: TrainingPairs, state: EMState, shares: Array, learn: Learner) -> EMState:
-    """The M-step for responsibilities (N, M)."""
+    """The M-step: update experts and gates for responsibilities (N, M)."""
     weighted = shares * features.weights[:, None]
     count = shares.shape[1]
     old: tuple[SparseRegression | None, ...] = state.experts or (None,) * count

@@ -55,14 +55,15 @@ if TYPE_CHECKING:
 
 # Candidate kernel widths, in typical distances between inputs.
 WIDTHS = (0.5, 1.0, 2.0)
-# Number of iterations in each round of the selection of a start; maximum number of its samples.
+# Number of EM iterations in each round that selects a start; maximum number of samples.
 TRIAL_ITERATIONS = (2, 4, 8)
 TRIAL_SAMPLES = 1000
 # Noise variance preferred by the prior, relative to the targets' variance.
 NOISE_FLOOR = 1e-2
 # Maximum number of experts in a file, and of basis functions of an expert.
 MAX_EXPERTS, MAX_ACTIVE_FUNCTIONS = 1000, 2000
-# Tolerance for rounding errors in correlations of weights: covariances vary by many orders.
+# Tolerance for rounding errors in correlations of weights: covariances span many orders of
+# magnitude.
 SEMIDEFINITE_TOLERANCE = 1e-6
 
 
@@ -72,7 +73,7 @@ class ExpertMixture(ConditionalDensity):
     Args:
         n_experts: Number of experts M at the start; experts without samples are pruned.
         basis: Basis functions of experts and gates: 'linear' or 'rbf' (Gaussian kernels).
-        width: Width of the kernels, in scaled inputs; None chooses among candidates.
+        width: Width of the kernels, in units of scaled inputs; None chooses among candidates.
         max_kernels: Maximum number of candidate kernels, spread over the training inputs.
         n_starts: Number of initialisations of EM for each width.
         tolerance: Gain of an iteration below which EM ends, nats per sample.
@@ -196,7 +197,7 @@ class ExpertMixture(ConditionalDensity):
         return [RadialBasis(self._scaling, centres, width) for width in widths]
 
     def _features(self, pairs: TrainingPairs, basis: Basis) -> TrainingPairs:
-        """Features of the inputs with standardised targets."""
+        """Evaluate the basis at the inputs, and standardise the targets."""
         targets = self._target_scaling.apply(pairs.targets)
         return TrainingPairs(basis.evaluate(pairs.inputs), targets, pairs.weights)
 
@@ -238,7 +239,7 @@ class ExpertMixture(ConditionalDensity):
     def _first_responsibilities(
         self, pairs: TrainingPairs, number: int, rng: np.random.Generator
     ) -> Array:
-        """Responsibilities (N, M) from clusters; `number` sets the weight of inputs and targets."""
+        """Responsibilities (N, M) from clusters; `number` selects the weight of the targets."""
         inputs = self._scaling.apply(pairs.inputs)
         targets = self._target_scaling.apply(pairs.targets)
         share = (0.5, 0.7, 0.9, 0.3)[number % 4]
@@ -320,7 +321,7 @@ class ExpertMixture(ConditionalDensity):
 class ConditionalExperts(ExpertMixture):
     """The conditional BME (BME 2.2.2): the gates are a softmax of the input, g = softmax(V phi(r)).
 
-    Arguments and attributes are those of `ExpertMixture`.
+    Arguments and attributes are as in `ExpertMixture`.
     """
 
     kind = 'conditional_experts'
@@ -332,7 +333,7 @@ class JointExperts(ExpertMixture):
 
         p(x, r) = sum_i a_i N(r; m_i, C_i) N(x; W_i phi(r), O_i)                    (BME 33)
 
-    Arguments and attributes are those of `ExpertMixture`.
+    Arguments and attributes are as in `ExpertMixture`.
     """
 
     kind = 'joint_experts'
@@ -340,7 +341,7 @@ class JointExperts(ExpertMixture):
 
 
 def _stored_expert(own: Mapping[str, NDArray[Any]]) -> SparseRegression:
-    """Read a regression; raises ValueError if its functions or covariances are invalid."""
+    """Read the regression of an expert; ValueError if its functions or covariances are invalid."""
     active, covariance = own['active'], own['covariance']
     m = len(active)
     different = m == len(np.unique(active)) <= MAX_ACTIVE_FUNCTIONS and (active >= 0).all()

@@ -47,7 +47,7 @@ MIN_PRECISION = 1e-5
 # Effective number of parameters per expert below which a basis function may be pruned.
 USELESS_PARAMETERS = 0.05
 DAMPING_LIMIT = 1e10
-NEWTON_STEPS = 3  # of one fit; the next M-step continues from its result
+NEWTON_STEPS = 3  # in one fit; the next M-step continues from the result
 # Maximum number of kernels of new softmax gates; number of samples per kernel.
 GATE_KERNELS, SAMPLES_PER_KERNEL = 60, 15
 
@@ -58,9 +58,9 @@ class SoftmaxGates:
 
     Attributes:
         basis: K basis functions phi.
-        weights: (M, K) V.
-        precisions: (K,) b.
-        penalty: Share of the bound that does not depend on the responsibilities, nats.
+        weights: (M, K) weights V.
+        precisions: (K,) precisions b of the weights.
+        penalty: Part of the bound that does not depend on the responsibilities, nats.
     """
 
     basis: Basis
@@ -72,7 +72,7 @@ class SoftmaxGates:
     def first(
         cls, experts: int, basis: Basis, pairs: TrainingPairs, scaling: Standardisation
     ) -> SoftmaxGates:
-        """Return equal gates of M experts, before learning, over kernels of the experts' basis."""
+        """Return equal initial gates of M experts, with kernels of the experts' basis."""
         if experts == 1:
             basis = LinearBasis(scaling)
         elif isinstance(basis, RadialBasis):
@@ -130,7 +130,7 @@ class SoftmaxGates:
 
 @dataclass(frozen=True, eq=False)
 class _SoftmaxFit:
-    """Weights with their precisions, and their part of the bound.
+    """Weights of the softmax, their precisions, and their part of the bound.
 
     Attributes:
         value: Part of the bound, nats.
@@ -258,7 +258,7 @@ class GaussianGates:
         covariances: (M, p, p) C, standardised.
         strength: Strength of the prior of C, in samples.
         target: (p, p) covariance preferred by the prior.
-        penalty: Share of the bound that does not depend on the responsibilities, nats.
+        penalty: Part of the bound that does not depend on the responsibilities, nats.
     """
 
     standardisation: Standardisation
@@ -280,7 +280,7 @@ class GaussianGates:
     def first(
         cls, experts: int, basis: Basis, pairs: TrainingPairs, scaling: Standardisation
     ) -> GaussianGates:
-        """Gates of M experts before learning."""
+        """Initial gates of M experts."""
         p = pairs.inputs.shape[1]
         share = pairs.weights / pairs.weights.sum()
         z = scaling.apply(pairs.inputs)
@@ -314,7 +314,7 @@ class GaussianGates:
     def learned(
         self, features: Array, responsibilities: Array, sample_weights: Array
     ) -> tuple[GaussianGates, Array]:
-        """Estimate weighted shares, means and covariances, the latter with their prior.
+        """Estimate weighted shares, means and covariances; only the covariances have a prior.
 
         a_i = sum_n h_ni / N                                                    (BME 45)
         m_i = sum_n h_ni r_n / sum_n h_ni                                       (BME 46)

@@ -3,12 +3,12 @@
     E(x) = 1/2 sum_ja ((a' (J_j(x) - t) - m_ja) / s_ja)^2 + 1/2 sum_l |A_l P_l(x)|^2 / n_l^2
            + E_prior(x)
 
-J_j is joint j of the pose x, a the axes of the camera that looks at the person, t the middle of the
-hips; P_l is landmark l, A_l the projection across the ray of its keypoint, n_l the noise of the
-keypoint. A closed form gives the initial pose (`body.limb_angles`), and linear least squares move
-it so that the landmarks lie near their rays. Newton's method within the limits finds the minimum;
-the inverse Hessian is the covariance. The distance of the person is hardly observable, so the
-spread of people's size is added along the line of sight.
+J_j is joint j of the pose x, a the axes of the camera that points at the person, t the middle of
+the hips; P_l is landmark l, A_l the projection perpendicular to the ray of its keypoint, n_l the
+noise of the keypoint. A closed form gives the initial pose (`body.limb_angles`), and linear least
+squares shift the pose so that the landmarks lie near their rays. Newton's method within the limits
+finds the minimum; the inverse Hessian is the covariance. The distance of the person is hardly
+observable, so the spread of people's size is added along the line of sight.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ ACROSS_FACTOR, KERNEL = 4.0, 4.0
 # Standard deviation of a landmark from its keypoint when the person is placed, m at the person.
 LANDMARK_SIGMA = 0.03
 # Factors on covariances: for correlated errors of keypoints and joints, and for unknown lengths of
-# the person. Chosen on clips: 90 % regions of single joints cover 88 %, with unknown lengths 80 %.
+# the person. Chosen on clips, where 90 % regions of single joints have a coverage of 88 %, or 80 %
+# with unknown lengths.
 JOINT_COVARIANCE_FACTOR, LENGTH_COVARIANCE_FACTOR = 4.0, 1.6
 # Relative standard deviation of the size of a person.
 KNOWN_SIZE, UNKNOWN_SIZE = 0.02, 0.06
@@ -77,7 +78,7 @@ def lift_poses(
         camera: static camera of the keypoints.
         stamps: (T,) times of the images, increasing, s.
         ups: (T, 3) unit vectors against gravity, camera frame; None: unknown.
-        lengths_known: whether the lengths of the body are those of the person.
+        lengths_known: whether the body has the lengths of the person.
         causal: whether each estimate ignores later images.
         scheme: scheme of the keypoints' names, see `keypoint_schemes`.
 
@@ -121,7 +122,7 @@ def poses_of(
     Args:
         body: body of the person, with the person's lengths if they are known.
         lifted: N mixtures with the same joints and the same number of components.
-        rays: (N, L, 2) rays x/z and y/z of the landmarks (`LANDMARKS`) in the same images.
+        rays: (N, L, 2) rays x/z and y/z of the landmarks (`LANDMARKS`) in the N images.
         confidences: (N, L) confidences of the landmarks; 0: not seen.
         size_spread: relative standard deviation of the person's size.
 
@@ -219,7 +220,7 @@ def _fitted(
 
 
 def _placed(body: Body, poses: Array, rays: Array, confidences: Array) -> tuple[Array, Array]:
-    """Move poses (M, d) so that landmarks lie near rays (M, L, 2); also covariances of roots."""
+    """Move poses (M, d) so that landmarks lie near rays (M, L, 2); also return root covariances."""
     places = forward(body.skeleton, poses).points(*_marks(body)).transpose(2, 0, 1)
     places = places - poses[:, None, :3]
     a, b = rays[..., 0], rays[..., 1]
@@ -266,7 +267,7 @@ class KeypointPredictor:
         self.newest = -math.inf
 
     def add(self, keypoints: Keypoints, stamp: float) -> None:
-        """Add the keypoints of the next image; its time, s, is later than all previous times."""
+        """Add the keypoints of the next image; its stamp, s, must exceed all previous stamps."""
         self._shown, self.newest = self._history.add(keypoints, stamp), stamp
 
     def predict(self, up: Array | None = None) -> GaussianMixture | None:

@@ -3,15 +3,15 @@
     p(y | r) = sum_i g_i(r) N(y; f_i(r), diag s_i(r)^2)
 
 y are the joint positions of a person of usual lengths, relative to the middle of the hips, in the
-frame of a camera that looks at the person; r is a window of keypoints. One network with shared
+frame of a camera that points at the person; r is a window of keypoints. One network with shared
 layers [Bishop 1994] gives the gates g, means f and deviations s. It is trained on motion capture
 with simulated cameras and detector errors (`keypoint_training`).
 
-    keypoints -> landmarks of all schemes -> rays -> the view of a camera that looks at the trunk
+    keypoints -> landmarks of all schemes -> rays -> the view of a camera that points at the trunk
 
 A window has one slot for each of `TIMES`, relative to the image of the estimate. The nearest image
 fills the slot if its time differs by at most `TIME_TOLERANCES`, so any frame rate works. The inputs
-are the positions of the landmarks in the plane of a camera that looks at the trunk, divided by
+are the positions of the landmarks in the plane of a camera that points at the trunk, divided by
 their extent, with confidences; the time offset of each image from its slot; the extent; and, if
 known, the direction against gravity in that camera and the proportions of the person. If gravity is
 known, that camera is rolled upright, because the experts were trained on upright cameras only.
@@ -65,7 +65,7 @@ from hmt_ros.inference.linear_algebra import product
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.inference.random_numbers import standard_normals
 
-# Slot times of a window relative to its image, s, and maximum offset of an image from each, s.
+# Slot times relative to the image of the window, s; maximum offset of an image from its slot, s.
 TIMES = np.array([0.0, -0.067, -0.15, -0.3, -0.5, -0.8, 0.067, 0.15, 0.3, 0.5, 0.8])
 TIME_TOLERANCES = np.array([0.02, *([0.045, 0.06, 0.09, 0.12, 0.17] * 2)])
 
@@ -97,7 +97,7 @@ TRUNK = np.array(
 )
 # Landmarks of body joints, for keypoints that are named after joints.
 OF_JOINTS = {'pelvis': 'mid_hip', 'neck': 'neck_base', 'head': 'centre_of_head'}
-# Lengths whose proportions are inputs; the rise of the shoulders is not among them.
+# Lengths whose proportions are inputs; the rise of the shoulders is excluded.
 PROPORTION_LENGTHS = (
     'thigh',
     'shin',
@@ -111,7 +111,7 @@ PROPORTION_LENGTHS = (
     'trunk',
     'neck_to_head',
 )
-# Minimum ratio of a length to the usual one; smaller ratios are clipped.
+# Minimum ratio of a length to the usual length; smaller ratios are clipped.
 MIN_LENGTH_RATIO = 0.3
 # Maximum number of components of a mixture over exchanges of sides.
 MAX_COMPONENTS = 12
@@ -135,7 +135,7 @@ class WindowInputs:
 
     Attributes:
         values: (N, p) inputs of the experts.
-        axes: (N, 3, 3) rows are the axes of a camera that looks at the person, camera frame.
+        axes: (N, 3, 3) axes, in rows, of a camera that points at the person; camera frame.
         known: (N,) whether a person is seen in the image of the window.
     """
 
@@ -210,7 +210,7 @@ def filled(
         causal: whether images after the time of a window are left out.
 
     Returns:
-        Rows (N, S) of the images, whether each is near enough (N, S), and their times (N, S)
+        Indices (N, S) of the images, whether each is near enough (N, S), and their times (N, S)
         relative to the windows, s.
     """
     wanted = at[:, None] + TIMES
@@ -235,7 +235,7 @@ def window_inputs(
         rays: (N, S, L, 2) x / z and y / z of the rays of the landmarks; arbitrary if the
             confidence is 0.
         confidences: (N, S, L) confidences from 0 (not seen) to 1.
-        times: (N, S) times of the images relative to that of the window, s.
+        times: (N, S) times of the images relative to the time of the window, s.
         ups: (N, 3) unit vectors against gravity, camera frame; 0: unknown.
         persons: (N, len(PROPORTION_LENGTHS)) proportions of the persons; 0: unknown.
     """
@@ -267,7 +267,7 @@ FOLDER = Path(__file__).resolve().parent / 'models'
 SHIPPED = 'keypoints'
 KIND = 'lifter'
 
-# Earliest time in a window, relative to its image, s; minimum z of unit rays as a divisor.
+# Earliest time in a window, relative to its image, s; minimum z by which unit rays are divided.
 EARLIEST_TIME, MIN_RAY_DEPTH = float((TIMES - TIME_TOLERANCES).min()), 0.1
 # Standard deviation above which a keypoint is ignored, m at the person.
 USELESS_SIGMA = 0.15
@@ -311,7 +311,7 @@ class Lifter:
     """Predicts mixtures over whole poses from windows of keypoints.
 
     Args:
-        usual: body with the usual lengths; it has all of the joints.
+        usual: body with the usual lengths, including all `joints`.
         notes: card of the file, serialisable as JSON.
     """
 
@@ -405,7 +405,7 @@ class Lifter:
         """Build the lifter that `to_arrays` and a card describe.
 
         Raises:
-            ValueError, LookupError, TypeError: arrays or parameters are missing, or wrong.
+            ValueError, LookupError, TypeError: arrays or parameters are missing or invalid.
         """
         parameters, card = parameters_of(arrays), parameters_of(arrays, 'card')
         windows = parameters['landmarks'], parameters['times']
@@ -437,7 +437,7 @@ class Lifter:
 
         Raises:
             FileNotFoundError: the file does not exist.
-            ValueError: the file is not a lifter, has another version, or is invalid.
+            ValueError: the file is not a lifter, has an unsupported version, or is invalid.
         """
         return read_model(path, KIND, cls.from_arrays)
 
@@ -446,8 +446,8 @@ def load_lifter(model: str = SHIPPED) -> Lifter:
     """Load the shipped lifter by its name, or a lifter from a file.
 
     Raises:
-        FileNotFoundError: neither the shipped name nor an existing file.
-        ValueError: the file is not a lifter, or has another version.
+        FileNotFoundError: the argument is neither the shipped name nor an existing file.
+        ValueError: the file is not a lifter, or has an unsupported version.
     """
     path = FOLDER / f'{SHIPPED}.npz' if model == SHIPPED else Path(model)
     return _loaded(path, path.stat().st_mtime_ns)
@@ -515,7 +515,7 @@ def landmark_rays(camera: Camera, keypoints: Keypoints, scheme: str = AUTO) -> t
     if len(shown):
         found = camera.rays(keypoints.pixels[shown])
         rays[places[shown]] = found[:, :2] / np.maximum(found[:, 2:], MIN_RAY_DEPTH)
-        # A keypoint with a large covariance carries no information, however confident it is.
+        # A keypoint with a large covariance carries no information, whatever its confidence.
         sigma = np.sqrt(0.5 * np.trace(keypoints.covariances[shown], axis1=1, axis2=2))
         known = ~(sigma > USELESS_SIGMA * keypoints.magnification())
         confidences[places[shown]] = np.where(known, keypoints.confidences[shown], 0.0)
@@ -523,7 +523,7 @@ def landmark_rays(camera: Camera, keypoints: Keypoints, scheme: str = AUTO) -> t
 
 
 def lifted_positions(camera: Camera, keypoints: Keypoints) -> LiftedPoses | None:
-    """Return the pose from a detector that estimates 3D positions; None if it lacks the hips."""
+    """Return the 3D pose that a detector estimates; None if the detector lacks the hips."""
     assert keypoints.positions is not None
     seen = keypoints.seen
     if not seen.any():

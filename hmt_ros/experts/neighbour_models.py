@@ -13,7 +13,7 @@ cluster is an expert. Its gate is the share of the kernel in the cluster; its me
 regression over the cluster. Local experts fit maps with many folds better than a few global
 experts, at the cost of storing the training set.
 
-In both, O is the covariance of the leave-one-out residuals of training targets.
+In both models, O is the covariance of the leave-one-out residuals of training targets.
 """
 
 from __future__ import annotations
@@ -165,7 +165,7 @@ class NearestNeighbours(_NeighbourModel):
         )
         ridge = self._keep_pairs(pairs)
         distances, index = self._nearest(self._scaled, self.n_neighbours + 1)
-        # A sample is its own neighbour, but not always the first one if inputs are equal.
+        # A sample is its own neighbour, but not always the first neighbour if inputs are equal.
         own = index == np.arange(len(pairs))[:, None]
         own[~own.any(1), -1] = True
         shape = (len(pairs), self.n_neighbours)
@@ -286,7 +286,7 @@ class LocalExperts(_NeighbourModel):
     def _modes(self, distances: Array, index: Index) -> tuple[Array, Array, Array, Array]:
         """Cluster the neighbours (n, K) of n inputs.
 
-        K-means weighted by the kernel, for all inputs at once; scipy's k-means has no weights.
+        Runs k-means weighted by the kernel, for all inputs at once; scipy's k-means has no weights.
 
         Returns:
             Weights (n, M) that sum to 1, heaviest first; means (n, M, D); shares (n, M, K) of the

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 # Maximum of |log sqrt(c)|.
 LOG_WIDTH_LIMIT = 2.0
 LEAK_SLOPE = 0.1  # slope of a unit below 0
-# Limits of a file: number of layers, size of whitened inputs, and size of the outputs for these.
+# Limits of a file: number of layers, size of whitened inputs, size of the outputs at such inputs.
 MAX_LAYERS, MAX_INPUT, MAX_OUTPUT = 100, np.float32(100.0), 1e15
 
 Floats = NDArray[np.float32]
@@ -45,9 +45,9 @@ class Layers:
     """Layers of H units, followed by O outputs.
 
     Attributes:
-        first, first_bias: (p, H), (H,).
-        hidden, hidden_biases: (M, H, H), (M, H).
-        last, last_bias: (H, O), (O,).
+        first, first_bias: (p, H) weights and (H,) biases of the first layer.
+        hidden, hidden_biases: (M, H, H) weights and (M, H) biases of M hidden layers.
+        last, last_bias: (H, O) weights and (O,) biases of the outputs.
     """
 
     first: Floats
@@ -62,14 +62,14 @@ class Layers:
         return np.asarray(product(self.features(inputs), self.last) + self.last_bias)
 
     def features(self, inputs: Floats) -> Floats:
-        """Units (N, H) of the last layer at whitened inputs (N, p)."""
+        """Activations (N, H) of the last layer of units at whitened inputs (N, p)."""
         units = _leaky(product(inputs, self.first) + self.first_bias)
         for weights, bias in zip(self.hidden, self.hidden_biases, strict=True):
             units = units + _leaky(product(units, weights) + bias)
         return units
 
     def jacobians(self, inputs: Floats, which: slice | Index) -> Floats:
-        """Derivatives (N, o, p) of some outputs with respect to whitened inputs (N, p)."""
+        """Derivatives (N, o, p) of selected outputs with respect to whitened inputs (N, p)."""
         before = product(inputs, self.first) + self.first_bias
         units = _leaky(before)
         slopes = _slopes(before)[:, :, None] * self.first.T
@@ -96,7 +96,7 @@ class Layers:
         own = {name: np.asarray(arrays[name], np.float32) for name in cls.__dataclass_fields__}
         m = len(own['hidden'])
         require(m <= MAX_LAYERS, f'it has {m} hidden layers, wanted at most {MAX_LAYERS}')
-        # The network of absolute weights, at the largest inputs, bounds all outputs.
+        # A network with the absolute weights, evaluated at the largest inputs, bounds all outputs.
         bound = cls(**{name: np.abs(values) for name, values in own.items()})
         largest = bound.outputs(np.full((1, p), MAX_INPUT)).max()
         require(largest <= MAX_OUTPUT, f'its outputs may be larger than {MAX_OUTPUT:g}')
@@ -107,8 +107,10 @@ class NetworkExperts(ConditionalDensity):
     """Experts that share the layers of one network.
 
     Args:
-        units, layers: Units of a layer, and number of residual layers after the first.
-        jitter: Standard deviation of the input noise in training, relative to that of the inputs.
+        units, layers: Number of units per layer, and number of residual layers after the first
+            layer.
+        jitter: Standard deviation of the input noise in training, relative to the inputs'
+            deviation.
 
     Attributes:
         noise_: (M, D, D) covariances O.
@@ -179,7 +181,7 @@ class NetworkExperts(ConditionalDensity):
         return np.asarray(self._of_targets.scale[0] * slopes / self._of_inputs.scale)
 
     def support(self, inputs: ArrayLike) -> Array:
-        """exp(-(d / 2 s)^2 / 2), (n,), for the distance d to the nearest cluster, of spread s."""
+        """exp(-(d / 2 s)^2 / 2), (n,), with distance d to the nearest cluster and spread s."""
         seen = self._of_inputs.apply(self._checked(inputs))
         away = squared_distances(seen, self._centres).min(1)
         return np.asarray(elementary.exp(-0.5 * away / (2.0 * self._spacing) ** 2))

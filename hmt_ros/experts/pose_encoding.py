@@ -28,7 +28,7 @@ TURNS = ('root_z', 'root_y', 'root_x')
 # Minimum length of an axis in derivatives. The mean over opposite headings is a short vector, and
 # its direction carries little information.
 MIN_AXIS_LENGTH = 0.1
-# Next and previous coordinate of each one, cyclically.
+# Next and previous coordinate of each coordinate, cyclically.
 NEXT_AXIS, PREVIOUS_AXIS = [1, 2, 0], [2, 0, 1]
 MAX_MIDDLE_ANGLE = np.radians(
     86.0
@@ -44,7 +44,7 @@ class PoseEncoding:
             the shipped bodies.
 
     Raises:
-        ValueError: the body has another root.
+        ValueError: the root of the body has other degrees of freedom.
     """
 
     body: Body
@@ -98,7 +98,8 @@ class PoseEncoding:
         targets, roots = self._checked(targets, roots)
         n, d = len(targets), self.body.dimension
         poses = self.decode(targets, roots)
-        # From a small rotation to root angles: the inverse of the matrix of their axes.
+        # The inverse of the matrix of rotation axes maps a small rotation to changes of root
+        # angles.
         axes = forward(self.body.skeleton, poses).axes[3:AXES].transpose(2, 1, 0)  # (N, 3, angle)
         from_rotation = pseudo_inverse(axes, float(elementary.cos(MAX_MIDDLE_ANGLE)) / 2)
         by_target, by_root = np.zeros((n, d, d)), np.zeros((n, d, 3))
@@ -150,7 +151,7 @@ class PoseEncoding:
 
 
 def ray_rotations(points: Array) -> Array:
-    """The smallest rotations (N, 3, 3) that turn the optical axis to points (N, 3).
+    """The smallest rotations (N, 3, 3) that turn the optical axis towards points (N, 3).
 
     Raises:
         ValueError: a point lies at the camera's centre or straight behind it.

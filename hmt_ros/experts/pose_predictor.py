@@ -4,7 +4,7 @@
     mask -> bounding box -> root of each component -> mixture over poses
 
 One object and one file contain everything that is learned. Rule (1) (BME 2.1) can propagate the
-mixture of the previous image, by a model of p(x_t | x_t-1, r_t) trained for one time step.
+mixture of the previous image, with a model of p(x_t | x_t-1, r_t) trained for one time step.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ from hmt_ros.inference.linear_algebra import inverse, product, singular_values
 from hmt_ros.inference.reduction import reduced
 
 FOLDER = Path(__file__).resolve().parent / 'models'
-# Name of the shipped model, learned from motion capture; its notes are its card.
+# Name of the shipped model, which was learned from motion capture.
 SHIPPED = 'silhouettes'
 
 KIND = 'pose_predictor'
@@ -70,12 +70,13 @@ MIN_WEIGHT = 1e-3  # weight below which a component is dropped
 RATE = 30.0
 STEP = 1.0 / RATE
 ADDED_VARIANCE = 1e-9  # variance added to each coordinate of poses, m^2 and rad^2
-# Ways to propagate a mixture: by rule (1), or not at all.
+# Methods of propagating a mixture: rule (1), or none.
 BY_EXPERTS, WITHOUT_PROPAGATION = 'experts', 'none'
 PROPAGATIONS = (BY_EXPERTS, WITHOUT_PROPAGATION)
 # Rate at which the past is discarded, 1/s, so that a lost track recovers. Chosen by hand.
 FORGETTING_RATE = 5.0
-# Maximum condition number of a target basis; maximum deviation of a short length from usual, m.
+# Maximum condition number of a target basis; maximum deviation of a short length from its usual
+# value, m.
 MAX_CONDITION, MAX_OFFSET = 1e12, 0.06
 
 
@@ -145,7 +146,7 @@ class PosePredictor:
         return self.encoding.body
 
     def with_body(self, body: Body) -> PosePredictor:
-        """Return the predictor for a body with other segment lengths, or another level.
+        """Return the predictor for a body with new segment lengths or a new level.
 
         Raises:
             ValueError: the body has other degrees of freedom.
@@ -189,7 +190,7 @@ class PosePredictor:
             max_components: Maximum number of components; the heaviest are kept.
             size_spread: Relative standard deviation of the person's size; 0 if the body has the
                 person's lengths.
-            image: (H, W, 3) BGR image, for edges inside the mask; None: unknown.
+            image: (H, W, 3) BGR image, for edges inside the mask; None if there is no image.
 
         Raises:
             NoSilhouetteError: the mask has no person.
@@ -262,7 +263,7 @@ class PosePredictor:
         # The model predicts over one `STEP`; the motion prior of the body covers the time before.
         before = self._to_targets(self._expected(previous, max(interval - STEP, 0.0)))
         # Steep experts would let the covariance grow without bound from step to step, so it is kept
-        # below that of p(x).
+        # below the covariance of p(x).
         known = inverse(before.covariances) + inverse(self.equilibrium.covariances)
         before = GaussianMixture(before.weights, before.means, inverse(known))
         after = propagate(
@@ -292,7 +293,7 @@ class PosePredictor:
         )
 
     def _to_targets(self, poses: GaussianMixture) -> GaussianMixture:
-        """Convert a mixture over poses to one over targets."""
+        """Convert a mixture over poses to a mixture over targets."""
         slopes = self.encoding.encoding_jacobians(poses.means)
         covariances = product(product(slopes, poses.covariances), slopes.transpose(0, 2, 1))
         # Unit vectors have no variance along themselves, so the covariance would be singular.
@@ -323,7 +324,7 @@ class PosePredictor:
         """Build the predictor that `to_arrays` and a card describe; see `load`.
 
         Raises:
-            ValueError, LookupError, TypeError: arrays or parameters are missing or wrong, or the
+            ValueError, LookupError, TypeError: arrays or parameters are missing or invalid, or the
                 body differs.
         """
         parameters = parameters_of(arrays)
@@ -355,7 +356,7 @@ class PosePredictor:
         )
 
     def answer(self, given: Array) -> GaussianMixture:
-        """Mixture over targets (D,) from silhouette parts; uses the dynamics if available."""
+        """Predict targets (D,) from silhouette parts; uses the dynamics if available."""
         contexts, *others = np.split(
             given, np.cumsum([-FIXED_FEATURES, PAIR_BINS, MAP_SIDE * MAP_SIDE, MOMENTS])
         )
@@ -369,7 +370,7 @@ class PosePredictor:
     def save(self, path: str | Path) -> Path:
         """Write the predictor to an .npz file, with its notes as the card, and return its path."""
         read = partial(self.from_arrays, body=self.body)
-        # Random numbers from 0 to 1, because most values of silhouette parts are.
+        # Random numbers from 0 to 1, because most values of silhouette parts are in this range.
         size = self.descriptor.points * RADIAL_BINS * ANGULAR_BINS + FIXED_FEATURES
         example = np.random.default_rng(0).integers(0, 64, size) / 64.0
         return write_model(path, self, read, self.notes, example)
@@ -384,7 +385,8 @@ class PosePredictor:
 
         Raises:
             FileNotFoundError: the file does not exist.
-            ValueError: the file is not a predictor, has another version or body, or is invalid.
+            ValueError: the file is not a predictor, has an unsupported version or a different body,
+                or is invalid.
         """
         return read_model(path, KIND, partial(cls.from_arrays, body=body))
 
@@ -393,8 +395,8 @@ def load_predictor(model: str | Path = SHIPPED) -> PosePredictor:
     """Load a shipped predictor by its name, or a predictor from a file that `train` wrote.
 
     Raises:
-        FileNotFoundError: neither a shipped name nor an existing file.
-        ValueError: the file is not a predictor, or has another version or body.
+        FileNotFoundError: the argument is neither a shipped name nor an existing file.
+        ValueError: the file is not a predictor, or has an unsupported version or a different body.
     """
     known = sorted(path.stem for path in FOLDER.glob('*.npz'))
     if str(model) in known:
@@ -428,7 +430,7 @@ def _heaviest(mixture: GaussianMixture, count: int) -> GaussianMixture:
 
 
 def _transformed(mixture: GaussianMixture, basis: Array) -> GaussianMixture:
-    """Convert a mixture over x to one over B' x."""
+    """Convert a mixture over x to a mixture over B' x."""
     covariances = product(product(basis.T, mixture.covariances), basis)
     covariances = 0.5 * (covariances + covariances.transpose(0, 2, 1))
     return GaussianMixture(mixture.weights, product(mixture.means, basis), covariances)

@@ -1,9 +1,9 @@
 """Root position of a predicted posture, from the position and the size of the silhouette.
 
-The shape of a silhouette does not show the depth; its size relative to that of the posture does.
-The root is moved until the exact projection of the posture's flesh has the bounding box of the
-silhouette. With the residual r(t), the sides of the box of the flesh at root t minus those of the
-silhouette, and J = dr/dt, the Gauss-Newton step is
+The shape of a silhouette does not show the depth, but its size relative to the posture does. The
+root is moved until the exact projection of the posture's flesh has the bounding box of the
+silhouette. The residual r(t) contains the sides of the flesh's box at root t minus the sides of the
+silhouette's box. With J = dr/dt, the Gauss-Newton step is
 
     t <- t - (J' S^-1 J + P^-1)^-1 (J' S^-1 r + P^-1 (t - t_0)),   S = J_x C J_x' + noise
 
@@ -32,8 +32,8 @@ from hmt_ros.experts.pose_encoding import PoseEncoding, cross
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.linear_algebra import inverse, product, solve
 
-STACKS, SLICES = 9, 12  # of the mesh; its bounding box is exact to 1 % of the radius of a part
-SIZE_SPREAD = 0.06  # relative standard deviation of the size of persons
+STACKS, SLICES = 9, 12  # of the mesh, whose bounding box is exact to 1 % of the radius of a part
+SIZE_SPREAD = 0.06  # relative standard deviation of people's size
 CUT_SPREAD = 0.15  # additional deviation for a person who is cut by the border
 # Standard deviations of a side of the box: from the outline, px; and from hair, clothes and shoes,
 # relative to the longer side of the box.
@@ -134,7 +134,8 @@ def placed_gaussians(
 ) -> tuple[Array, Array]:
     """Convert Gaussians over targets and roots to Gaussians over poses, (M, d) and (M, d, d).
 
-    The root depends on the posture such that the projected box still equals the silhouette's.
+    If the posture varies, the root moves so that the projected box still equals the silhouette's
+    box.
 
     Args:
         targets, covariances: (M, D), (M, D, D) Gaussians over the targets of the postures.
@@ -188,7 +189,7 @@ def _box_error(
     sides: Array,
     cut: NDArray[np.bool_],
 ) -> tuple[Array, Array, Array]:
-    """Sides of the boxes of M postures minus those of the silhouette, and their derivatives.
+    """Sides of the boxes of M postures minus the sides of the silhouette's box, and derivatives.
 
     `slopes` are the Jacobians of the encoding near these postures and roots.
 

@@ -11,9 +11,9 @@ M = L^-1 Phi' H X, and the evidence, the integral over W of the weighted likelih
 
 where T = sum h. For given precisions the best O is (X'HX - M'LM + prior) / (T + nu). For given O
 the best precision of one function has the closed form of Tipping and Faul (AISTATS 2003), here with
-all D outputs together. Functions are added, removed and re-estimated one at a time, always the one
-that gains most. Only the sums Phi'H Phi, Phi'HX and X'HX are needed, so a step costs O(K m + K D)
-for K candidates and m active functions, independent of the number of samples.
+all D outputs together. Functions are added, removed and re-estimated one at a time, always with the
+largest gain. Only the sums Phi'H Phi, Phi'HX and X'HX are needed, so a step costs O(K m + K D) for
+K candidates and m active functions, independent of the number of samples.
 """
 
 from __future__ import annotations
@@ -82,9 +82,9 @@ class SparseRegression:
     Attributes:
         active: (m,) indices of basis functions.
         precisions: (m,) diagonal of A.
-        weights: (m, D) M.
+        weights: (m, D) posterior mean M.
         covariance: (m, m) L^-1; the covariance of the weights is its Kronecker product with O.
-        noise: (D, D) O.
+        noise: (D, D) covariance O of the noise.
         evidence: log evidence plus the penalty of the noise, nats.
     """
 
@@ -155,10 +155,10 @@ def maximise_evidence(
     """Maximise the evidence, starting from an earlier result or from no functions.
 
     Args:
-        start: Earlier result; its samples may have had other weights.
+        start: Earlier result to start from; the sample weights may have changed since.
         steps: Number of greedy steps between two estimates of the noise.
         rounds: Maximum number of estimates of the noise.
-        tolerance: Gain of a round below which the rounds end, nats.
+        tolerance: Gain of a round, nats, below which the rounds end.
     """
     if start is None:
         none: Index = np.zeros(0, dtype=np.intp)
@@ -183,7 +183,7 @@ def _greedy(
     steps: int,
     tolerance: float,
 ) -> tuple[SparseRegression, bool]:
-    """Add, remove and re-estimate functions for a fixed noise, each time the best one."""
+    """Add, remove and re-estimate functions for a fixed noise, one best change at a time."""
     state = _GreedyState(sums, found)
     moved = False
     for _ in range(steps):

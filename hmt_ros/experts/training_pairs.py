@@ -129,7 +129,7 @@ def checked_pairs(
 
 
 def finite_matrix(values: ArrayLike, name: str, wanted: str) -> Array:
-    """Values as a matrix of finite numbers.
+    """Convert values to a matrix of finite numbers.
 
     Raises:
         ValueError: the values do not have two axes, or are not finite.

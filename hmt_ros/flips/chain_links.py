@@ -27,7 +27,7 @@ class ChainLinks(NamedTuple):
         first_dofs: (K + 1,) position in `dofs` of each link's first degree of freedom.
         dofs: (D,) indices of the degrees of freedom of all links.
         lower, upper: (D,) limits of the angles, rad.
-        sides: (K, 2) whether the limits of a link admit each of the two solutions for its angles.
+        sides: (K, 2) for each of a link's two solutions, whether the limits allow it.
     """
 
     segments: NDArray[np.int64]
@@ -48,7 +48,7 @@ def chain_links(skeleton: Skeleton, name: str) -> ChainLinks:
 
     Raises:
         KeyError: the skeleton has no such chain.
-        ValueError: the joints have no closed form, or no angle satisfies the limits.
+        ValueError: the joints have no closed-form solution, or no angle satisfies the limits.
     """
     if name not in skeleton.chains:
         raise KeyError(f'{skeleton.name} has no chain {name!r}; it has {sorted(skeleton.chains)}')
@@ -104,7 +104,7 @@ def chain_links(skeleton: Skeleton, name: str) -> ChainLinks:
 
 @lru_cache(maxsize=64)
 def _signs(lower: float, upper: float, sine: bool) -> list[bool]:
-    """Whether angles within the limits have a positive, and a negative, sine or cosine."""
+    """Whether some angle within the limits has a positive, and a negative, sine or cosine."""
     samples = np.linspace(lower, min(upper, lower + 2.0 * np.pi), 721)
     values = elementary.sin(samples) if sine else elementary.cos(samples)
     return [bool(np.any(values > 1e-6)), bool(np.any(values < -1e-6))]

@@ -4,10 +4,10 @@ A link of length l leads from a known joint P to a joint on the unit ray r. This
 
     s r,    s = r.P +- sqrt((r.P)^2 - |P|^2 + l^2).
 
-The choices of sign along a chain are the leaves of its interpretation tree; for a branching body,
-the trees of its chains are multiplied. Every leaf has the image and the segment lengths of the
-given pose, which is the first leaf. A branch is pruned if its ray misses the sphere, if a joint is
-behind the camera, or if no joint angles within the limits reach it.
+Each choice of signs along a chain is a leaf of its interpretation tree. For several chains, the
+leaves of their trees are combined. Every leaf has the image and the segment lengths of the given
+pose, which is the first leaf. A branch is pruned if its ray misses the sphere, if a joint is behind
+the camera, or if no joint angles within the limits reach it.
 
 `distinct_poses` compares joint positions, because poses do not have unique angles: a rotation has
 two triples of Euler angles, Rx(a) Ry(b) Rz(c) = Rx(a + pi) Ry(pi - b) Rz(c + pi), angles are
@@ -36,17 +36,18 @@ def enumerate_flips(
 
     Args:
         body: body of the poses.
-        poses: (N, d) poses in the camera frame. Flips move joints along their rays, so the lens of
-            the camera does not matter.
-        chains: name of a chain, or several names, whose trees are multiplied.
+        poses: (N, d) poses in the camera frame. Flips move joints along their rays, so camera
+            intrinsics are not needed.
+        chains: name of a chain, or several names, whose flips are combined.
 
     Returns:
-        Poses (M, d), grouped by given pose, and the index (M,) of the given pose. A given pose is
-        the first of its group.
+        Poses (M, d), grouped by given pose, and for each the index (M,) of its given pose. A given
+        pose is the first of its group.
 
     Raises:
         KeyError: the body has no such chain.
-        ValueError: the joints of a chain have no closed form, or two chains share segments.
+        ValueError: the joints of a chain have no closed-form solution, or two chains share
+            segments.
 
     Example:
         Four poses of an arm have one image: the upper arm and the forearm each lead towards the
@@ -83,7 +84,7 @@ def enumerate_flips(
 
 
 def _leaves(frames: Frames, poses: Array, chain: ChainLinks) -> tuple[Array, NDArray[np.bool_]]:
-    """Angles (N, leaves, chain dofs) and validity (N, leaves) of leaves; 0 is the given pose."""
+    """Angles (N, leaves, chain dofs) and validity (N, leaves); leaf 0 is the given pose."""
     lengths = chain.lengths[:, None, None]
     ends = frames.origins[chain.segments] - lengths * frames.columns[chain.segments, 2]
     count = 2 ** len(chain.lengths)
@@ -101,8 +102,8 @@ class Distinct(NamedTuple):
 
     Attributes:
         kept: (K,) indices of the kept poses, ascending.
-        owner: (N,) position in `kept` of the representative of each pose; -1 if the maximum number
-            was reached before.
+        owner: (N,) position in `kept` of the pose that represents each pose; -1 if none does,
+            because the maximum number was reached.
     """
 
     kept: Index
@@ -112,17 +113,17 @@ class Distinct(NamedTuple):
 def distinct_poses(joints: ArrayLike, apart: float, most: int | None = None) -> Distinct:
     """Selects poses that differ from all earlier poses.
 
-    The distance of two poses is the largest distance of a joint. If kept poses are nearer than
-    `apart` to a pose, the nearest of them represents it. So early, better poses represent later
-    ones.
+    The distance of two poses is the largest distance between corresponding joints. A pose nearer
+    than `apart` to a kept pose is represented by the nearest kept pose. If poses are sorted best
+    first, better poses represent worse poses.
 
     Args:
         joints: (N, J, 3) joint positions of the poses, m.
-        apart: minimum distance of two distinct poses, m.
+        apart: minimum distance between distinct poses, m.
         most: maximum number of kept poses; None: no maximum.
 
     Raises:
-        ValueError: the joints have another shape.
+        ValueError: the joints do not have the shape (N, J, 3).
     """
     points = np.ascontiguousarray(joints, dtype=np.float64)
     if points.ndim != 3 or points.shape[2] != 3:

@@ -1,14 +1,14 @@
 """Configurations of all limbs on the trunks of a group of modes, and their products (KJS 3).
 
 Modes with nearly the same trunk form a group. On the group's trunk each limb has several
-configurations: those of the modes, their flips, and the results of a search. Further trunks have
-the same image: with two limbs exchanged, or with the torso flipped in depth. On each of these
-trunks a limb has all configurations that keep its image.
+configurations: the configurations of the modes, their flips, and the results of a search. Further
+trunks have the same image, but with two limbs exchanged, or with the torso flipped in depth. On
+each of these trunks a limb has all configurations that keep its image.
 
 A product combines one configuration of each limb. Because limbs are nearly independent given the
-trunk, the energy of a product is that of its trunk plus the change due to each configuration alone:
-a few dozen evaluations rate thousands of poses. Compiled functions process a group per call; the
-energies are evaluated between two calls.
+trunk, the energy of a product is the energy of its trunk plus the change due to each configuration
+alone. So a few dozen evaluations rate thousands of poses. Compiled functions process a group per
+call; the energies are evaluated between two calls.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Limbs(NamedTuple):
     """The C limbs of a body, with at most K links and D variables, for the compiled functions.
 
     Attributes:
-        links, dofs, joints: (C,) numbers of links, of degrees of freedom and of moved joints.
+        links, dofs, joints: (C,) numbers of links, degrees of freedom and moved joints.
         segments, parents, mounts, mounted, lengths, first_dofs, own, lower, upper, sides: the
             attributes of `ChainLinks`, zero-padded to the largest limb.
         joint_segments, joint_offsets: segments (C, J) and offsets (C, J, 3) of the joints that a
@@ -66,7 +66,7 @@ def limbs_of(skeleton: Skeleton) -> Limbs:
     """Collects the limbs of a skeleton, in the order of its chains.
 
     Raises:
-        ValueError: a chain has no closed form; see `chain_links`.
+        ValueError: a chain has no closed-form solution; see `chain_links`.
     """
     names = list(skeleton.chains)
     chains = [chain_links(skeleton, name) for name in names]
@@ -111,10 +111,10 @@ def _filled(arrays: list[NDArray[Any]]) -> NDArray[Any]:
 
 
 class Configurations(NamedTuple):
-    """Configurations of limbs on T trunks; the first is the trunk of a group of G modes.
+    """Configurations of limbs on T trunks, of which the first belongs to a group of G modes.
 
     Attributes:
-        trunks: (T, d) one pose with each trunk.
+        trunks: (T, d) for each trunk, a pose with this trunk.
         angles: (T, C, A, D) angles of each configuration of each limb.
         counts: (T, C) numbers of configurations; 0: the same configurations as on the first trunk.
         penalties: (G, C, A) minus the log probability that a mode changes to each configuration on
@@ -133,7 +133,7 @@ class Products:
 
     Attributes:
         poses: (N, d) poses.
-        parents: (N,) position in the group of the source mode of each pose.
+        parents: (N,) for each pose, the position of its source mode in the group.
         energies: (N,) estimated energies.
     """
 
@@ -174,14 +174,14 @@ class LimbProducts:
         """Finds the configurations of all limbs for a group.
 
         Args:
-            body: body with at least one chain; its chains must have closed forms.
+            body: body with at least one chain; all chains must have closed-form solutions.
             modes: (G, d) poses of the group, best first.
-            found: further configurations (F, chain dofs) by name of the chain.
-            price: penalty of a configuration other than the mode's own, nats.
-            apart: minimum distance in some joint between distinct configurations, m.
+            found: further configurations (F, chain dofs) for each chain name.
+            price: penalty of configurations that differ from the mode's, nats.
+            apart: minimum distance between distinct configurations, in at least one joint, m.
             most: maximum number of configurations of a limb on a trunk.
-            poses: maximum number of poses to evaluate, for which the last trunks are left out, but
-                never the group's own trunk.
+            poses: maximum number of poses to evaluate. If it is exceeded, the last trunks are left
+                out, but never the group's trunk.
         """
         limbs, skeleton = limbs_of(body.skeleton), body.skeleton
         modes = np.ascontiguousarray(modes, dtype=np.float64)
@@ -218,9 +218,10 @@ class LimbProducts:
 
     @property
     def alone(self) -> tuple[Array, Index]:
-        """Poses (P, d) to evaluate, and rows (R,) of the pose of each trunk and configuration.
+        """Poses (P, d) to evaluate, and the row (R,) of the pose for each trunk and configuration.
 
-        For each trunk, the rows are its pose, then this pose with each configuration of one limb.
+        For each trunk, the rows are its pose, followed by this pose with each limb changed to each
+        configuration.
         """
         found = self.configurations
         count = len(found.trunks) + int(found.counts.sum())

@@ -26,7 +26,7 @@ JOINTS = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_sho
 
 
 def flip_torso(body: Body, poses: ArrayLike) -> tuple[Array, Index]:
-    """Flips the torso in depth: up to seven poses for each given pose.
+    """Flips the torso in depth: returns up to seven flips of each pose.
 
     Args:
         body: body with the joints of a torso, a root that rotates about z, y and x, and a segment
@@ -34,8 +34,8 @@ def flip_torso(body: Body, poses: ArrayLike) -> tuple[Array, Index]:
         poses: (N, d) poses.
 
     Returns:
-        Poses (M, d) within the limits, with unchanged angles of the limbs, and the index (M,) of
-        the given pose of each.
+        Poses (M, d) within the limits, with unchanged angles of the limbs, and for each the index
+        (M,) of its given pose.
     """
     skeleton = body.skeleton
     q = np.array(poses, dtype=np.float64, ndmin=2, order='C')
@@ -52,7 +52,7 @@ class _Torso(NamedTuple):
     """Torso, as input for the compiled functions.
 
     Attributes:
-        root, trunk: degrees of freedom that rotate the root (3,) and the trunk (0, 2 or 3).
+        root, trunk: degrees of freedom that rotate the root (3,) and the trunk (0, 2 or 3 of them).
         segment: index of the trunk's segment.
         joint_segments, joint_offsets: segments (6,) and offsets (6, 3) of the `JOINTS`.
         lower, upper: (d,) limits of the pose.

@@ -1,1 +1,1 @@
-"""Evidence of images about poses: background, observation, optical flow, likelihood."""
+"""Evidence about poses from images: background, observation, optical flow, likelihood."""

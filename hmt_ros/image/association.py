@@ -1,16 +1,16 @@
 """Assignment of people detected in an image to the tracked people.
 
-    cost(i, j) = median_k |u_ik + v_i dt - p_jk| / s_i        over the joints k that both have
+    cost(i, j) = median_k |u_ik + v_i dt - p_jk| / s_i        over the common joints k
 
-u_i are the last seen joints of person i, v_i is the velocity of the person in the image, s_i the
-size of the person, and p_j are the joints of detection j. If the two have no common joints, the
-centres of their boxes are used. A pair is possible below a cost that grows with the time since the
-person was last seen. The assignment minimises the sum of costs; a person without a detection has
-the cost of the worst possible pair.
+u_i are the last seen joints of person i, v_i is the person's velocity in the image, s_i the
+person's size, and p_j are the joints of detection j. If person and detection have no common joints,
+the centres of their boxes are used. A pair is possible if its cost is below a limit, which grows
+with the time since the person was last seen. The assignment minimises the sum of costs; for a
+person without a detection the cost is this limit.
 
-The nearer of two people hides the farther one. For the farther person, all pixels of the nearer one
-are unknown; for the nearer person, pixels of the farther one are unknown only outside the nearer
-person's own area.
+Of two people, the nearer person hides the farther person. For the farther person, all pixels of the
+nearer person are unknown. For the nearer person, pixels of the farther person are unknown only
+outside the nearer person's own area.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.inference.error_model import seconds
 
-# Cost below which a pair is possible from one image to the next, in sizes of the person; this limit
-# doubles within `EXPECTED_TIME`.
+# Maximum cost of a pair just after a sighting, in sizes of the person; this limit doubles within
+# `EXPECTED_TIME`.
 GATE_COST = 0.4
-# Time for which a person is assumed to keep velocity and, even if less is visible, size, s.
+# Time for which a person is assumed to keep the velocity, and the size if a part is hidden, s.
 EXPECTED_TIME = 1.0
-# Time constant of the velocity of a person in the images, s.
+# Time constant of a person's mean velocity in the images, s.
 VELOCITY_TIME = 0.25
-# Margin of the masked area of a person, or of the hull of keypoints, for the radius of a limb, as a
-# fraction of the height.
+# Margin around a person's mask or hull of keypoints, for the radius of limbs, as a fraction of the
+# height.
 LIMB_MARGIN = 0.05
 
 
@@ -53,7 +53,7 @@ class Sighting:
 
     @classmethod
     def of(cls, keypoints: Keypoints, corners: Array) -> Sighting:
-        """A sighting from a box and from keypoints; there may be no keypoints."""
+        """A sighting from a box and the seen keypoints, possibly none."""
         seen = np.flatnonzero(keypoints.seen)
         return cls({keypoints.names[i]: keypoints.pixels[i] for i in seen}, corners)
 
@@ -68,7 +68,7 @@ class Sighting:
         return max(float(elementary.hypot(*(self.corners[1] - self.corners[0]))), 1.0)
 
     def shifts_to(self, other: Sighting) -> Array:
-        """Shifts (n, 2) of the common joints, or else of the box centre, to another sighting."""
+        """Shifts (n, 2) to another sighting, of common joints; if missing, of the box centre."""
         common = [name for name in self.joints if name in other.joints]
         if not common:
             return np.asarray((other.middle - self.middle)[None])
@@ -80,12 +80,12 @@ class ImageTrack:
 
     Args:
         sighting: first sighting.
-        stamp: stamp of its image, ns.
+        stamp: stamp of the sighting's image, ns.
 
     Attributes:
         sighting: last sighting.
-        stamp: stamp of its image, ns.
-        velocity: (2,) px/s.
+        stamp: stamp of the sighting's image, ns.
+        velocity: (2,) velocity in the image, px/s.
         size: size of the person, px; it shrinks slowly when a part of the person is hidden.
     """
 
@@ -100,7 +100,7 @@ class ImageTrack:
         dt = seconds(stamp - self.stamp)
         moved = np.median(self.sighting.shifts_to(sighting), axis=0)
         self._known_for += dt
-        # At first the mean over all sightings, later the mean over the last moments.
+        # The velocity is at first the mean over all sightings, later a mean over recent sightings.
         gain = min(dt / min(self._known_for, VELOCITY_TIME), 1.0)
         self.velocity += gain * (moved / dt - self.velocity)
         self.size = max(sighting.size, self.size * float(elementary.exp(-dt / EXPECTED_TIME)))
@@ -117,19 +117,19 @@ class ImageTrack:
         return float(np.median(elementary.hypot(*off.T))) / self.size
 
     def gate(self, stamp: int) -> float:
-        """Cost from which a sighting is another person."""
+        """Association cost above which a sighting belongs to another person."""
         return GATE_COST * (1.0 + min(seconds(stamp - self.stamp) / EXPECTED_TIME, 1.0))
 
 
 def assigned(
     tracks: Sequence[ImageTrack], sightings: Sequence[Sighting], stamp: int
 ) -> dict[int, int]:
-    """Indices of the assigned sightings by index of the track, for tracks with a sighting."""
+    """Mapping from the index of each assigned track to the index of its sighting."""
     if not tracks or not sightings:
         return {}
     costs = np.array([[track.cost(each, stamp) for each in sightings] for track in tracks])
     gates = np.array([track.gate(stamp) for track in tracks])[:, None]
-    # An impossible pair costs the same as no pair.
+    # An impossible pair has the cost of a person without a detection.
     rows, columns = linear_sum_assignment(np.where(costs < gates, costs, gates))
     return {
         int(row): int(column)
@@ -139,7 +139,7 @@ def assigned(
 
 
 def unknown_area(mine: Mask, nearer: Sequence[Mask], farther: Sequence[Mask]) -> Mask | None:
-    """Pixels (H, W) without evidence about a person; None if missing.
+    """Pixels (H, W) without evidence about a person because of other people; None if empty.
 
     Args:
         mine: (H, W) pixels that the person covers.
@@ -154,7 +154,7 @@ def unknown_area(mine: Mask, nearer: Sequence[Mask], farther: Sequence[Mask]) ->
 
 
 def hull(sighting: Sighting, shape: tuple[int, ...]) -> Mask:
-    """Pixels (H, W) in the hull of a person's joints, or else in the box, with a margin."""
+    """Pixels (H, W) in the hull of a person's joints, or in the box if joints are few, enlarged."""
     joints = np.array(list(sighting.joints.values()))
     if len(joints) < 3:
         (left, top), (right, bottom) = sighting.corners.tolist()
@@ -165,7 +165,7 @@ def hull(sighting: Sighting, shape: tuple[int, ...]) -> Mask:
 
 
 def grown(area: Mask) -> Mask:
-    """An area (H, W) with a margin."""
+    """An area (H, W) enlarged by the margin for limbs."""
     return resized(area, LIMB_MARGIN)
 
 

@@ -1,10 +1,10 @@
 """The person's silhouette by background subtraction, shadows removed.
 
 The background is either a given image of the empty scene or learned from frames in which the person
-is absent or moves. A model of the table `BACKGROUNDS` does the per-pixel work, on images reduced
-to about `IMAGE_LINES` lines, so that the cost does not depend on the camera. The outline is
-interpolated to subpixels of these images. A background that shows the person is rebuilt from pixels
-of later images that the person does not cover.
+is absent or moves. A model of the table `BACKGROUNDS` labels the pixels of images reduced to about
+`IMAGE_LINES` lines, so that the cost does not depend on the camera's resolution. The outline is
+interpolated with subpixel accuracy. If the background shows the person, it is rebuilt from those
+pixels of later images that the person does not cover.
 
 `SceneWatch` checks whether the camera has moved since the background was taken:
 
@@ -12,7 +12,8 @@ of later images that the person does not cover.
 
 on images that are `WIDTH` px wide, for shifts of up to `REACH`. The maximum is at s = 0 as long as
 the camera has not moved, even if people walk in front of it or the light changes, because edges
-stay in place. After a small movement the maximum is elsewhere; after a larger one no shift fits.
+stay in place. After a small movement the maximum is at another shift; after a large movement no
+shift fits.
 """
 
 from __future__ import annotations
@@ -47,14 +48,14 @@ BACKGROUNDS: dict[str, Callable[[float, float], Background]] = {
 # Approximate number of lines of reduced images; they are reduced by an integer factor.
 IMAGE_LINES = 240
 
-# Tolerance when a pixel is compared with the neighbouring pixels of the background, grey levels,
-# because compression and aliasing move edges.
+# Tolerance when a pixel is compared with neighbouring pixels of the background, because compression
+# and aliasing move edges, grey levels.
 SPATIAL_TOLERANCE = 8
-# Number of images without the person that must agree before a pixel is known again, and tolerance
-# of this agreement, grey levels.
+# Number of images that must agree at a pixel that the person does not cover, before the pixel is
+# known again, and tolerance of this agreement, grey levels.
 AGREEING_IMAGES = 10
 AGREEMENT_TOLERANCE = 20.0
-# Margin around a mask for morphological operations on it, px.
+# Margin around a mask for morphological operations, px.
 MASK_MARGIN = 2
 
 
@@ -86,7 +87,7 @@ class BackgroundSettings:
             raise ValueError(f'background method must be {known}, saw {self.method!r}')
 
     def new_model(self) -> Background:
-        """A model of the chosen method that has seen no image."""
+        """A new background model of the chosen method."""
         return BACKGROUNDS[self.method](self.threshold, self.shadow_threshold)
 
 
@@ -108,7 +109,7 @@ class BackgroundModel:
 
     Attributes:
         settings: parameters of the subtraction.
-        frames: number of images that were learned.
+        frames: number of learned images.
         changed: fraction of the pixels of the last image that differ from the background, including
             shadows.
     """
@@ -120,7 +121,7 @@ class BackgroundModel:
         self.changed = 0.0
         self._shape: tuple[int, ...] = ()
         self._nearby: tuple[Image, Image] | None = None
-        # Cache of the last image and its labels, because several people share one background.
+        # The last image and its labels are cached, because several people share one background.
         self._last: tuple[Image, Image] | None = None
         self._parts: _Parts | None = None
 
@@ -155,7 +156,7 @@ class BackgroundModel:
         self._learn_alone(np.zeros(shape, dtype=np.uint8))
 
     def complete(self, image: Image, person: Mask) -> None:
-        """Learns unknown pixels of the background where the person (H, W) does not cover them.
+        """Learns those unknown pixels of the background that the person (H, W) does not cover.
 
         Raises:
             ValueError: the image differs in shape from earlier images.
@@ -170,46 +171,46 @@ class BackgroundModel:
 
     @property
     def unknown(self) -> Mask | None:
-        """Pixels (H, W) not yet seen without the person since `forget`; None if all are known."""
+        """Pixels (H, W) whose background is unknown since `forget`; None if all are known."""
         return None if self._parts is None else self._parts.unknown
 
     @property
     def empty(self) -> Image:
-        """The empty scene (h, w, 3) as far as it is known, at the size of the reduced images."""
+        """Known parts of the empty scene (h, w, 3), at the size of the reduced images."""
         return self._model.empty
 
     def foreground(self, image: Image) -> Mask:
-        """Pixels (H, W) that differ from the background and are no shadow.
+        """Pixels (H, W) that differ from the background and are not shadow.
 
         False where the background is unknown. The model does not change.
 
         Raises:
-            ValueError: no background was learned, or the image has another size.
+            ValueError: no background was learned, or the image has a wrong size.
         """
         return self._larger(self._subtracted(image) == FOREGROUND_LABEL)
 
     def silhouette(self, image: Image, region: Box | None = None) -> Mask:
-        """Foreground (H, W) of an image: the largest piece and pieces near it, without shadow.
+        """Silhouette (H, W): the largest piece of the foreground, and pieces near it; no shadow.
 
         Empty if nothing differs from the background. The model does not change.
 
         Args:
             image: (H, W, 3) uint8.
-            region: (left, top, right, bottom) where the person can be, px, right and bottom
-                exclusive; other people may be outside.
+            region: box (left, top, right, bottom) that can contain the person, px; right and bottom
+                are exclusive.
 
         Raises:
-            ValueError: no background was learned, or the image has another size.
+            ValueError: no background was learned, or the image has a wrong size.
         """
         return self.split(image, region).foreground
 
     def split(
         self, image: Image, region: Box | None = None, others: Mask | None = None
     ) -> Silhouette:
-        """Foreground of an image, as for `silhouette`, and unsure pixels.
+        """The result of `silhouette` for an image, and the unsure pixels.
 
         Args:
-            others: (H, W) pixels that somebody else covers; None if missing.
+            others: (H, W) pixels that other people cover; None if missing.
         """
         raw = self._subtracted(image)
         if others is not None:
@@ -264,7 +265,7 @@ class BackgroundModel:
 
     @property
     def _factor(self) -> int:
-        """Integer factor by which images are reduced."""
+        """Integer factor by which width and height of images are reduced."""
         return max(round(self._shape[0] / IMAGE_LINES), 1)
 
     def _smaller(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -324,8 +325,8 @@ class _Parts:
         shape: (H, W, 3) of the images.
 
     Attributes:
-        unknown: (H, W) pixels that are not known yet.
-        changed: whether pixels have become known since this was last set to False.
+        unknown: (H, W) pixels whose background is still unknown.
+        changed: whether pixels have become known since the flag was last cleared.
     """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
@@ -336,7 +337,7 @@ class _Parts:
 
     @property
     def image(self) -> Image:
-        """The background (H, W, 3), as far as it is known."""
+        """The background (H, W, 3), which can have unknown pixels."""
         return np.asarray(np.rint(self._mean), dtype=np.uint8)
 
     def add(self, image: Image, empty: Mask) -> None:
@@ -344,7 +345,7 @@ class _Parts:
         rows, columns = np.nonzero(empty & self.unknown)
         values = image[rows, columns].astype(np.float32)
         mean, agreeing = self._mean[rows, columns], self._agreeing[rows, columns]
-        # Pixels that disagree start again, because a person was there before or is there now.
+        # Where an image disagrees, counting restarts: a person was there before or is there now.
         agreeing[np.abs(values - mean).max(1, initial=0.0) > AGREEMENT_TOLERANCE] = 0
         agreeing += 1
         self._mean[rows, columns] = mean + (values - mean) / agreeing[:, None]
@@ -355,7 +356,7 @@ class _Parts:
 
 
 def one_person(mask: Mask, settings: BackgroundSettings, region: Box | None = None) -> Mask:
-    """The largest piece of a mask (H, W), with pieces large and near enough to belong to it."""
+    """The largest piece of a mask (H, W), and pieces large and near enough to belong to it."""
     result = np.zeros(mask.shape, dtype=np.bool_)
     inside = _around(mask, region)
     part = mask[inside]
@@ -366,7 +367,7 @@ def one_person(mask: Mask, settings: BackgroundSettings, region: Box | None = No
 
 
 def pieces_of(mask: Mask) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Labels (H, W) of the connected pieces of a mask, and OpenCV's statistics of them (N, 5)."""
+    """Labels (H, W) and OpenCV's statistics (N, 5) of the connected pieces of a mask."""
     pixels = np.ascontiguousarray(mask).view(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
         pixels, 8, cv2.CV_32S, cv2.CCL_BBDT
@@ -375,7 +376,7 @@ def pieces_of(mask: Mask) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
 
 
 def of_one_person(stats: NDArray[np.int32], settings: BackgroundSettings) -> Mask:
-    """Which pieces (N,) of a mask belong to its largest one; piece 0 is the background.
+    """Whether each piece (N,) of a mask belongs to the largest piece; piece 0 is the background.
 
     Args:
         stats: (N, 5) OpenCV's statistics of the pieces.
@@ -393,9 +394,9 @@ def of_one_person(stats: NDArray[np.int32], settings: BackgroundSettings) -> Mas
 
 
 def _around(pixels: NDArray[np.bool_ | np.uint8], region: Box | None = None) -> tuple[slice, slice]:
-    """Rows and columns that bound the nonzero pixels of a region (None: all), with a margin.
+    """Slices of rows and columns around the nonzero pixels in a region (None: all), with a margin.
 
-    They are empty if all pixels are 0. They save time, because most of an image is empty.
+    The slices are empty if all pixels are 0. They save time, because most of an image is empty.
     """
     left, top, right, bottom = region or (0, 0, pixels.shape[1], pixels.shape[0])
     part = pixels[top:bottom, left:right].view(np.uint8)
@@ -411,11 +412,11 @@ def _around(pixels: NDArray[np.bool_ | np.uint8], region: Box | None = None) -> 
 WIDTH, REACH = 320, 24
 # Maximum gradient length; standard deviation of the Gaussian before the derivative, px.
 MAX_GRADIENT, SMOOTHING_SIGMA = 200.0, 1.0
-# Number of images per examined one, and number of successive examined images that must agree.
+# Only every n-th image is examined: n, and number of successive examined images that must agree.
 EXAMINATION_INTERVAL, CONFIRMING_IMAGES = 10, 2
 # Minimum correlation at the best shift, and its minimum excess over the correlation at shift 0.
 MIN_CORRELATION, MIN_CORRELATION_GAIN = 0.3, 0.05
-# Correlation at shift 0, as a fraction of its first value, below which the scene has changed.
+# Correlation at shift 0 below which the scene has changed, as a fraction of its first value.
 OTHER_SCENE_FRACTION = 0.4
 
 
@@ -424,7 +425,7 @@ class SceneWatch:
 
     Attributes:
         moved: whether the camera has moved since the background was taken.
-        shift: distance of the scene from its place in the background, px; NaN if too large to
+        shift: displacement of the scene since the background was taken, px; NaN if too large to
             measure.
     """
 
@@ -437,7 +438,7 @@ class SceneWatch:
         self._usual = 0.0
 
     def update(self, image: Image, background: BackgroundModel) -> None:
-        """Compares an image (H, W, 3) with a background, unless this is partly unknown."""
+        """Compares an image (H, W, 3) with a background; skipped if the background has gaps."""
         self._count += 1
         if self._count % EXAMINATION_INTERVAL != 1 or background.unknown is not None:
             return
@@ -468,7 +469,7 @@ def edges_of(image: Image) -> NDArray[np.float32]:
 def _correlation(
     background: NDArray[np.float32], image: NDArray[np.float32]
 ) -> tuple[float, float, float]:
-    """Length of the best shift, px, the correlation at this shift, and that at shift 0."""
+    """Length of the best shift, px, correlation at this shift, and correlation at shift 0."""
     inner = background[REACH:-REACH, REACH:-REACH]
     found = np.nan_to_num(cv2.matchTemplate(image, inner, cv2.TM_CCOEFF_NORMED))
     row, column = np.unravel_index(int(found.argmax()), found.shape)

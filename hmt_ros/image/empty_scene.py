@@ -1,18 +1,17 @@
 """The empty scene of a camera that stands still, and checks whether it contained a person.
 
-A given background is the empty scene. A background that is learned from images shows a person who
-stood still in them. Silhouettes then lack this person, and contain a ghost in the person's place.
-Both look like correct silhouettes, so the fault is found by other cues:
+A given background is the empty scene. A background that is learned from images contains any person
+who stood still in these images. Silhouettes then lack this person, and contain a ghost where the
+person stood. Both faults give silhouettes of plausible shape, so they are detected by other cues:
 
-    still     log odds -= dt / STILL_TIME          people move; a scene in which nothing does is
-    empty moved     log odds = 0, learned again     a piece as large as a part of a person has
-    changed outline   log odds -= a(dt) N (u - m)     u: share of the outline of a silhouette at
-    which the
-                                              image has the stronger edges, not the background
+    still      log odds -= dt / STILL_TIME       people move; a scene without motion is empty
+    moved      log odds = 0, scene relearned     a piece as large as a part of a person has changed
+    outline    log odds -= a(dt) N (u - m)       u: fraction of a silhouette's outline where edges
+                                                 of the image exceed edges of the background
 
-The log odds are for a person in the learned scene. A person in front of a scene covers its edges; a
-ghost has its edges in the background. If a detector sees nobody, less time is needed, and moving
-objects are not taken for a person.
+The log odds are for the presence of a person in the learned scene. The outline of a person has
+edges in the image; the outline of a ghost has edges in the background. If a detector finds nobody,
+less time is needed, and moving objects are not taken for a person.
 """
 
 from __future__ import annotations
@@ -32,11 +31,12 @@ UNSEEN = (
     'the scene has not been seen empty and still for two seconds; wanted that, or background_file, '
     'or a detector (use_keypoints, or "install-detector")'
 )
-# Time constant of a person who keeps still, and of a still person whom a detector misses, s;
+# Time constants of a person who keeps still, and of a still person whom a detector misses, s;
 # maximum change of the log odds in one image, nats.
 STILL_TIME, UNDETECTED_TIME, MAX_NATS = 0.4, 0.1, 3.5
-# Log odds of a person in the scene, nats: maximum for silhouettes to be used; minimum due to
-# stillness alone, because a person may sleep; value below which silhouettes are no longer judged.
+# Log odds of a person in the scene, nats: maximum at which silhouettes are used; minimum that
+# stillness can give, because a person may sleep; value below which silhouettes are no longer
+# checked.
 USABLE_LOG_ODDS, MIN_STILL_LOG_ODDS, SURE_LOG_ODDS = -3.5, -5.0, -14.0
 # Blur of compared images, px; time constant of their mean, s; minimum change of a pixel that is not
 # noise, grey levels; minimum size of a changed piece that is part of a person, as a fraction of the
@@ -52,12 +52,12 @@ class EmptyScene:
     """Learns the empty scene, and checks whether it contains a person.
 
     Args:
-        background: a given background, or a model that has seen no image.
-        trusted: whether the background is learned and checked elsewhere.
+        background: a given background, or a new model without images.
+        trusted: whether other code learns and checks the background.
 
     Attributes:
         background: the learned scene.
-        seen: whether the scene was seen for long enough; silhouettes are then used and judged.
+        seen: whether the scene was observed for long enough for silhouettes to be used and checked.
         log_odds: log odds of a person in the learned scene, nats.
     """
 
@@ -72,26 +72,26 @@ class EmptyScene:
 
     @property
     def known(self) -> bool:
-        """Whether the scene was seen for long enough and contains nobody."""
+        """Whether the scene was observed for long enough and contains nobody."""
         return self.background.frames > 0 and self.seen and self.log_odds < USABLE_LOG_ODDS
 
     @property
     def wants(self) -> str:
-        """Message about missing input for silhouettes; '' if nothing is missing."""
+        """Message about input that silhouettes still need; '' if nothing is missing."""
         return '' if self.known else UNSEEN
 
     @property
     def is_of_somebody(self) -> bool:
-        """Whether the scene was seen for long enough and probably contains a person."""
+        """Whether the scene was observed for long enough and probably contains a person."""
         return self.seen and self.log_odds > 0.0
 
     def learn(self, image: Image, stamp: int, detected: bool | None = None) -> None:
-        """Learns from an image (H, W, 3), unless a detector sees a person in it.
+        """Learns from an image (H, W, 3), unless a detector finds a person in the image.
 
         Args:
             image: image of the scene.
             stamp: stamp of the image, ns, later than the previous one.
-            detected: whether a detector or a segmenter sees a person; None if unknown.
+            detected: whether a detector or a segmenter finds a person; None if unknown.
         """
         if self.log_odds == -math.inf or detected:
             return
@@ -132,7 +132,7 @@ class EmptyScene:
         self._judged = stamp
 
     def _has_moved(self, image: Image, dt: float) -> bool:
-        """Whether a part as large as that of a person has moved since earlier images."""
+        """Whether a piece as large as a part of a person has changed since earlier images."""
         width = min(WIDTH, image.shape[1])
         height = max(round(image.shape[0] * width / image.shape[1]), 1)
         resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)

@@ -2,15 +2,16 @@
 
     E_t(x) = a_i E_image(x) + E_keypoints(x; a_k, a_l) + a_p (E_prior(x) + E_known(x))
 
-Errors of images persist, so the energy of a cue g is multiplied by a share a_g, which depends on
-the time since the previous image (`inference.error_model`), as in the filter; the prior of an
-exchange of sides is not scaled. A persistent error does not change the shape of a motion. If
-`of_changes` is set, the terms of the image are therefore scaled by `CueErrors.of_changes` instead,
-and covariances are enlarged by `CueErrors.persistence_ratio` afterwards. The share of keypoints
-stays the same, because their errors drift, and a motion would follow the drift.
+Errors persist from image to image. As in the filter, the energy of a cue g is therefore multiplied
+by a share a_g, which depends on the time since the previous image (`inference.error_model`). The
+prior of an exchange of sides is not scaled. A persistent error does not change the shape of a
+motion. If `of_changes` is set, the terms of the image are therefore scaled by
+`CueErrors.of_changes` instead, and covariances are enlarged by `CueErrors.persistence_ratio`
+afterwards. The share of keypoints remains a_k, because their errors drift, and a motion would
+follow the drift.
 
-Each image keeps the bone lengths and the flesh with which its own poses were estimated. Later
-estimates of these move the root along the line of sight, which would look like motion.
+Each image keeps the bone lengths and the flesh with which its poses were estimated. Later estimates
+of lengths and flesh move the root along the line of sight, which would look like motion.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ from hmt_ros.inference.error_model import ERRORS, seconds
 
 @dataclass(frozen=True, eq=False)
 class SeenImage:
-    """The believed evidence of one image about a person.
+    """Evidence of one image about a person, with the probabilities of the cues.
 
     Attributes:
         likelihood: likelihood of images of this person.
         observation: evidence of the image.
-        known: further terms of the pose, for gravity and floor.
+        known: additional energy terms, for gravity and floor.
     """
 
     likelihood: ImageLikelihood
@@ -56,11 +57,11 @@ class SeenImage:
 
 @dataclass(frozen=True, eq=False)
 class ImageSequence:
-    """-log p(r_t | x_t) of T images; an `EnergyTerm` whose rows are times.
+    """Energies -log p(r_t | x_t) of T images; an `EnergyTerm` whose rows are times.
 
     Attributes:
         images: the T images.
-        shares: shares a_g by name of the cue, for each image.
+        shares: for each image, the shares a_g by name of the cue.
     """
 
     images: Sequence[SeenImage]
@@ -73,7 +74,7 @@ class ImageSequence:
         """The sequence of images with these stamps (T,), without evidence before the first image.
 
         Args:
-            of_changes: whether `CueErrors.of_changes` gives the share of the terms of the image.
+            of_changes: whether the share of the image terms is `CueErrors.of_changes`.
         """
         intervals = [np.inf, *(seconds(b - a) for a, b in pairwise(stamps_ns))]
         shares = [
@@ -93,7 +94,7 @@ class ImageSequence:
     def energy(
         self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
     ) -> Energy:
-        """See `EnergyTerm`; the rows are times. All derivatives are returned, or none."""
+        """See `EnergyTerm`; the rows are times. Either all derivatives are returned or none."""
         n, d = x.shape
         asked = n if derivatives else 0
         value, gradient, hessian = np.empty(n), np.empty((asked, d)), np.empty((asked, d, d))
@@ -111,7 +112,7 @@ class ImageSequence:
 
     @cached_property
     def _terms(self) -> list[list[tuple[PoseEnergy, float]]]:
-        """Sums of terms and the factors on them, for each time."""
+        """For each time, sums of terms, with a factor on each sum."""
         result = []
         for image, share in zip(self.images, self.shares, strict=True):
             # Callers may run in several threads, which already use all cores.

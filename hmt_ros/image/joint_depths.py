@@ -1,12 +1,12 @@
 """Depths of joints with known pixels from a depth image, for the start of a track.
 
-A joint lies behind the skin at its pixel, approximately by the radius of the flesh there:
+A joint lies behind the skin at its pixel, at a distance of approximately the flesh's radius there:
 
     z_j = D(u_j) + r_j +- sigma_j,   sigma_j^2 = (r_j / 2)^2 + DEPTH_SIGMA^2
 
 D is a low quantile of the depths around the pixel, because limbs are thin and the background is
-behind them. Depths of an object in front of the joint, or of a neighbouring surface, are outliers,
-so the kernel is robust.
+behind them. A robust kernel is used, because depths of an object in front of the joint or of a
+neighbouring surface are outliers.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from hmt_ros.inference.arrays import Array, Index
 
 # Margin of the window around the pixel of a joint, px, and quantile of the depths in this window.
 MASK_MARGIN, DEPTH_QUANTILE = 2, 0.25
-# Standard deviation of the depth of a joint, apart from the error of the flesh, m.
+# Standard deviation of a joint's depth without the error of the flesh, m.
 DEPTH_SIGMA = 0.03
 # Width of the Geman-McClure kernel, in standard deviations.
 KERNEL_SCALE = 4.0
-# Minimum number of trunk points with a depth to locate a person.
+# Minimum number of trunk points with measured depth to locate a person.
 MIN_JOINTS = 3
-# Quantile of the depths of trunk points, below the median because the background is behind, and
-# number of iterations.
+# Quantile of the depths of trunk points, below the median because the background is farther away,
+# and number of iterations.
 TRUNK_QUANTILE, ITERATIONS = 0.35, 2
 
 
@@ -52,7 +52,7 @@ class JointDepths:
 
     Attributes:
         joints: (M,) joints of the skeleton.
-        depths: (M,) along the axis of the camera, m.
+        depths: (M,) depths along the axis of the camera, m.
         sigma: (M,) standard deviations of the depths, m.
     """
 
@@ -61,7 +61,7 @@ class JointDepths:
     sigma: Array
 
     def residuals(self, depths: Array) -> tuple[Array, Array, Array]:
-        """Energies (M,) of joint depths (M,), m, with their derivatives and curvatures."""
+        """Energies (M,) of joint depths (M,), m, and the energies' derivatives and curvatures."""
         error = (depths - self.depths) / self.sigma
         shrink = 1.0 / (1.0 + (error / KERNEL_SCALE) ** 2)
         curvature = shrink**2 / self.sigma**2
@@ -69,7 +69,7 @@ class JointDepths:
 
 
 def joint_depths(body: Body, keypoints: Keypoints, depths: ImageMap | None) -> JointDepths:
-    """Depths of the joints of seen keypoints, where the depth image has measurements."""
+    """Depths of the joints at seen keypoints for which the depth image has measurements."""
     shown = np.flatnonzero(keypoints.seen) if depths is not None else np.zeros(0, np.intp)
     joints = body.skeleton.joint_index([keypoints.names[i] for i in shown])
     radii = _radii(body)[joints] if len(shown) else np.zeros(0)
@@ -92,7 +92,8 @@ def moved_to_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap | 
     result = poses.copy()
     for _ in range(ITERATIONS):
         joints = body.joint_positions(result)[:, index]
-        # If a pose is too near, its joints may miss the person; points nearer the middle may not.
+        # If a pose is too near, its joints may project beside the person; points nearer the middle
+        # do not.
         inside = 0.5 * (joints + joints.mean(1, keepdims=True))
         for pose, points in zip(result, np.concatenate([joints, inside], axis=1), strict=True):
             skin = _depths_at(depths, camera.project(points))
@@ -104,11 +105,11 @@ def moved_to_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap | 
 
 
 def _depths_at(depths: ImageMap, pixels: Array) -> Array:
-    """Depths (P,) of the front surface around pixels (P, 2), m; 0 where nothing was measured."""
+    """Depths (P,) of the nearest surface around pixels (P, 2), m; 0 where nothing was measured."""
     values = depths.values[0]
     height, width = values.shape
     steps = np.arange(-MASK_MARGIN, MASK_MARGIN + 1)
-    # Clip pixels of points far outside or behind the camera; they stay outside the image.
+    # Clip pixels of points that are far outside the image or behind the camera; they stay outside.
     centres = np.clip(np.nan_to_num(pixels, nan=-1e6), -1e6, 1e6)
     columns, rows = (np.rint(centres) - [depths.left, depths.top]).astype(np.intp).T
     rows = (rows[:, None, None] + steps[:, None]).repeat(len(steps), axis=2)

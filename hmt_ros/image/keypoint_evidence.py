@@ -1,4 +1,4 @@
-"""Evidence of keypoints for a person in the image, and whether they can start a track."""
+"""Evidence of keypoints for a person in the image, and tests whether they can start a track."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from hmt_ros.inference.arrays import Array
 
 # Minimum number of keypoints of a person.
 MIN_KEYPOINTS = 6
-# Minimum confidence for the position of a keypoint to be trusted.
+# Minimum confidence of a keypoint whose position is trusted.
 MIN_CONFIDENCE = 0.5
-# Magnification, px/m, at which keypoints are no evidence of a person; at twice this value they are
-# full evidence. Detectors find small people in table legs and in leaves, with full confidence.
+# Magnification, px/m, up to which keypoints are no evidence of a person; from twice this value they
+# are full evidence. Detectors find small people in table legs and in leaves, with full confidence.
 MIN_MAGNIFICATION = 22.0
 
 
 def keypoint_evidence(keypoints: Keypoints, body: Body) -> float:
-    """Evidence of a detector for a person in the image, from -1 (nobody) to 1.
+    """Evidence from a detector for a person in the image, from -1 (nobody) to 1.
 
-    It is 1 if the sum of the confidences is at least that of the minimum number of keypoints at
-    minimum confidence, and -1 below a third of this sum. With fewer keypoints, or for a person of
-    few pixels, it is at most 0.
+    The evidence is 1 if the sum of the confidences reaches `MIN_KEYPOINTS` times `MIN_CONFIDENCE`,
+    and -1 below a third of this value. With fewer keypoints, or for a very small person, it is at
+    most 0.
     """
     seen = keypoints.confidences[keypoints.seen]
     most = 0.0
@@ -36,9 +36,9 @@ def keypoint_evidence(keypoints: Keypoints, body: Body) -> float:
 
 
 def suffices(keypoints: Keypoints | None, body: Body) -> bool:
-    """Whether keypoints of one image determine position and facing of a person.
+    """Whether the keypoints of one image determine position and facing of a person.
 
-    They must include all joints of the trunk, or all except one.
+    The keypoints must include all joints of the trunk except at most one.
     """
     if keypoints is None:
         return False
@@ -49,7 +49,7 @@ def suffices(keypoints: Keypoints | None, body: Body) -> bool:
 
 
 def shows_a_part(keypoints: Keypoints | None, body: Body) -> bool:
-    """Whether keypoints show a person, and determine the facing."""
+    """Whether keypoints are evidence of a person and determine the facing."""
     if keypoints is None or keypoint_evidence(keypoints, body) <= 0.0:
         return False
     names = _confident(keypoints)
@@ -62,7 +62,7 @@ def _confident(keypoints: Keypoints) -> set[str]:
 
 
 def _magnification(keypoints: Keypoints, body: Body) -> float:
-    """Approximate magnification, px/m, from the extent of the joints of a standing person."""
+    """Approximate magnification, px/m, from the extent of the keypoints if the person stands."""
     standing = _standing(body)
     known = [i for i in np.flatnonzero(keypoints.seen) if keypoints.names[i] in standing]
     if not known:

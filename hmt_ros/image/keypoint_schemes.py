@@ -1,7 +1,7 @@
 """Keypoint schemes: the landmark names of detectors, and the places of landmarks on a body.
 
 A detector's "hip" is a point on the skin that annotators agreed on, not the centre of the joint.
-`keypoint_schemes.yaml` is the one table of names and offsets.
+`keypoint_schemes.yaml` contains all names and offsets.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ MAX_FILE_BYTES = 1_000_000  # bytes
 
 @dataclass(frozen=True, eq=False)
 class Landmark:
-    """A point of a person that detectors find.
+    """A point on a person's body that detectors find.
 
     Attributes:
         name: canonical name.
-        joint: joint of the package's bodies at or near the landmark; '' if missing.
+        joint: joint at or near the landmark, named as in the package's bodies; '' if missing.
         offset: (3,) from the joint to the landmark in the frame of the joint's segment, m, for a
             person of 1.7 m.
-        sigma: standard deviation over people of each component of the offset, m.
+        sigma: standard deviation of each component of the offset over people, m.
     """
 
     name: str
@@ -97,16 +97,16 @@ def schemes() -> Mapping[str, Scheme]:
 
 @cache
 def unnamed_orders() -> Mapping[int, tuple[str, ...]]:
-    """Possible schemes of keypoints without names, the usual one first, by number of keypoints.
+    """For each number of keypoints without names, the possible schemes, the usual scheme first.
 
-    If a scheme has fewer names, they belong to the first keypoints.
+    A scheme with fewer names describes the first keypoints only.
     """
     return {int(count): tuple(names) for count, names in _table()['unnamed'].items()}
 
 
 @cache
 def bone_lengths() -> Mapping[tuple[str, str], tuple[float, float]]:
-    """Distance of two landmarks of a 1.7 m person, m, and standard deviation of its logarithm."""
+    """Distance, m, of landmark pairs of a 1.7 m person, and standard deviation of its logarithm."""
     return {
         (one.format(side=side), other.format(side=side)): (float(length), float(sigma))
         for one, others in _table()['bones'].items()
@@ -116,7 +116,7 @@ def bone_lengths() -> Mapping[tuple[str, str], tuple[float, float]]:
 
 
 def scheme_of(names: Sequence[str], scheme: str = AUTO) -> Scheme | None:
-    """The scheme of keypoints; None if their names are names of joints.
+    """The scheme of keypoints with these names; None if the names are names of joints.
 
     Args:
         scheme: name of a scheme, 'joints', or 'auto' for the result of `recognised`.
@@ -136,9 +136,10 @@ def scheme_of(names: Sequence[str], scheme: str = AUTO) -> Scheme | None:
 
 
 def recognised(names: Sequence[str]) -> Scheme | None:
-    """The smallest scheme that has all names, if the names include a nose or a spine.
+    """The smallest scheme with all names, if one exists and the names include a nose or a spine.
 
-    Limbs and trunk have the same names in all schemes; alone, these are taken as names of joints.
+    Names of limbs and trunk are the same in all schemes; without further names they are taken as
+    joints.
     """
     fitting = [x for x in schemes().values() if set(names) <= set(x.names)]
     found = min(fitting, key=lambda x: len(x.names), default=None)
@@ -148,10 +149,11 @@ def recognised(names: Sequence[str]) -> Scheme | None:
 def landmarks_of(
     names: Sequence[str], joints: Sequence[str], scheme: str = AUTO
 ) -> list[Landmark | None]:
-    """The landmarks of keypoints by their names; None for a joint of the body or an unknown name.
+    """The landmark of each named keypoint; None for a joint of the body or an unknown name.
 
     Args:
-        joints: names of the body's joints; without a scheme, a keypoint of such a name is a joint.
+        joints: names of the body's joints; if no scheme is found, a keypoint with such a name is a
+            joint.
 
     Raises:
         ValueError: there is no such scheme.
@@ -178,10 +180,10 @@ def noise_of(confidences: Array) -> Array:
 
 @cache
 def position_deviations(scheme: str | None) -> Mapping[str, float]:
-    """Standard deviations of a detector's joint depths, by the kind of the joint, m.
+    """Standard deviations of a detector's joint depths, m, by kind of joint.
 
     Args:
-        scheme: name of the detector's scheme; None, or one without measured values, gives usual
+        scheme: name of the detector's scheme; None or a scheme without measured values gives usual
             values.
     """
     content = _table()['positions']
@@ -190,7 +192,7 @@ def position_deviations(scheme: str | None) -> Mapping[str, float]:
 
 @cache
 def exchange_rates() -> Array:
-    """Rates (E, E), 1/s, at which a detector changes from one exchange of sides to another."""
+    """Transition rates (E, E), 1/s, between a detector's exchanges of sides."""
     rates = np.array(_table()['exchanges']['rates'], dtype=np.float64)
     return rates - np.diag(rates.sum(1))
 

@@ -2,12 +2,12 @@
 
     p(y) = sum_c w_c prod_ja N(y_ja; m_cja, s_cja^2),    y_j: joint j from the middle of the hips
 
-The axes a lie across and along the line of sight to the person. Experts (`experts.lifter`) give
-several components. A network that estimates one pose gives one component without uncertainty; its
-standard deviations are learned (`keypoint_schemes.yaml`).
+Two of the axes a lie across the line of sight to the person, the third along it. Experts
+(`experts.lifter`) give several components. A network that estimates one pose gives one component;
+its standard deviations are learned (`keypoint_schemes.yaml`).
 
-The estimated bone lengths need not be the person's. Only the directions of bones are used: every
-bone is scaled to its length in the body of the person.
+The estimated bone lengths can differ from the person's. Only the directions of bones are used:
+every bone is scaled to its length in the body of the person.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ WHOLE_BODY_CARRIERS = {
         for side in ('left', 'right')
     ),
 }
-# Standard deviation of a joint without an estimate, m.
+# Standard deviation of the coordinates of a joint without an estimate, m.
 UNKNOWN_SIGMA = 0.5
 HIPS = ('left_hip', 'right_hip')
 # Parent of each kind of joint; joints of other kinds have the middle of the hips as parent.
@@ -58,9 +58,9 @@ class LiftedPoses:
         joints: (J,) names of joints of the package's bodies.
         log_weights: (C,) log weights of the components.
         means: (C, J, 3) positions relative to the middle of the hips, along the axes, m.
-        deviations: (C, J, 3) standard deviations along the axes, m.
-        axes: (3, 3) unit vectors in rows, camera frame; the last one is the line of sight.
-        lengths: (J,) lengths in the means of the bones from the parents to the joints, m.
+        deviations: (C, J, 3) standard deviations of the positions along the axes, m.
+        axes: (3, 3) unit vectors in rows, camera frame; the last row is the line of sight.
+        lengths: (J,) lengths of the bones from the parents to the joints in the means, m.
     """
 
     joints: tuple[str, ...]
@@ -78,7 +78,7 @@ class LiftedPoses:
 
     @property
     def are_whole(self) -> bool:
-        """Whether the joints determine a whole pose; only toes and hands can be missing."""
+        """Whether the joints determine a whole pose: all except toes and hands are required."""
         return {*self.joints} >= WHOLE_BODY_CARRIERS
 
     def of_joints(self, names: Sequence[str]) -> LiftedPoses:
@@ -94,7 +94,7 @@ class LiftedPoses:
         )
 
     def sized(self, skeleton: Skeleton) -> Array:
-        """The means (C, J, 3) with the bone lengths of a skeleton that has the joints."""
+        """The means (C, J, 3) scaled to the bone lengths of a skeleton that has these joints."""
         return self._with_lengths(bone_lengths(skeleton, self.joints))
 
     def _with_lengths(self, own: Array) -> Array:
@@ -104,7 +104,7 @@ class LiftedPoses:
         return result
 
     def resized(self, other: LiftedPoses) -> Array:
-        """The means (C, J, 3) with bone lengths of another mixture for the joints of both."""
+        """The means (C, J, 3), scaled to another mixture's bone lengths at the common joints."""
         own = self.lengths.copy()
         rows, others = shared(self.joints, other.joints)
         own[rows] = other.lengths[others]
@@ -128,7 +128,8 @@ def pooled(opinions: Sequence[LiftedPoses]) -> LiftedPoses:
     """One mixture from several estimates of one pose, with equal weights.
 
     The estimates use the same image, so they are not independent, and their densities are averaged.
-    A joint that an estimate lacks has the standard deviation `UNKNOWN_SIGMA` in its components.
+    If an estimate lacks a joint, the joint has the standard deviation `UNKNOWN_SIGMA` in the
+    components of this estimate.
     """
     first = opinions[0]
     if len(opinions) == 1:
@@ -154,16 +155,17 @@ def from_positions(
     deviations: Mapping[str, float],
     seen: Mask | None = None,
 ) -> LiftedPoses | None:
-    """The pose that a network estimates; None if a hip or all other joints are missing.
+    """The mixture for a network's single pose; None if a hip or all other joints are missing.
 
     Args:
-        joints: (n,) names of joints; the first of equal names is used. A joint is ignored if the
-            joint of the other side is unknown, because sides may be exchanged.
+        joints: (n,) names of joints; if a name is repeated, the first joint with known position is
+            used. A joint is ignored if its counterpart on the other side is unknown, because sides
+            may be exchanged.
         positions: (n, 3) positions along the axes of the camera, from any origin, m; NaN: unknown.
-        axes: (3, 3) as in `LiftedPoses`.
-        deviations: standard deviations of joints by their kind, m.
-        seen: (n,) whether the network has seen a joint; other joints have the standard deviation
-            `UNKNOWN_SIGMA`. None: all were seen.
+        axes: (3, 3) axes as in `LiftedPoses`.
+        deviations: standard deviations by kind of joint, m.
+        seen: (n,) whether each joint was visible to the network; hidden joints get the standard
+            deviation `UNKNOWN_SIGMA`. None: all were visible.
     """
     known: dict[str, int] = {}
     for i in np.flatnonzero(np.isfinite(positions).all(1)).tolist():
@@ -190,7 +192,7 @@ def from_positions(
 
 @lru_cache(maxsize=64)
 def shared(joints: tuple[str, ...], others: tuple[str, ...]) -> tuple[Index, Index]:
-    """Indices of the common joints in the first and in the second sequence."""
+    """Indices of the common joints in each of two sequences of names."""
     rows = [(i, others.index(name)) for i, name in enumerate(joints) if name in others]
     own, theirs = np.array(rows, dtype=np.intp).reshape(-1, 2).T
     return own, theirs
@@ -239,7 +241,7 @@ def bone_lengths(skeleton: Skeleton, joints: tuple[str, ...]) -> Array:
 
 
 def bones(joints: tuple[str, ...], places: Array, origin: Array) -> Array:
-    """Vectors (J, 3) to joints at places (J, 3) from their parents, or else from the origin."""
+    """Vectors (J, 3) from the parents, or the origin if missing, to joints at places (J, 3)."""
     rows, carriers = ordered(joints).T
     result = np.empty_like(places)
     result[rows] = places[rows] - np.where(carriers[:, None] < 0, origin, places[carriers])

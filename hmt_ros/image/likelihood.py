@@ -3,7 +3,7 @@
     E(x) = sum_t E_t(x) + E_keypoints(x) + E_prior(x) + E_intersection(x)
 
 over the image terms t of `terms.registry`. `ImageLikelihood` makes the terms; a `PoseEnergy` sums
-a selection of them.
+selected terms.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class LikelihoodSettings(_ImageTerms):  # type: ignore[misc]
 
     @classmethod
     def of_terms(cls, **settings: TermSettings) -> LikelihoodSettings:
-        """Settings with the named image terms and keypoints, all others switched off."""
+        """Settings in which image terms and keypoints are switched off unless given."""
         names = [*(term.name for term in TERMS), 'keypoints']
         chosen: dict[str, Any] = {name: settings.get(name, OFF) for name in names}
         return cls(**chosen)
@@ -84,15 +84,15 @@ LikelihoodSettings.__doc__ = '\n'.join(
 
 @dataclass(frozen=True, eq=False)
 class ImageLikelihood:
-    """The energy of poses of a body in front of a camera, given an image.
+    """Energy of a body's poses, given an image from a camera.
 
     Attributes:
-        body, camera: the person, and the camera that sees the person.
+        body, camera: body of the person, and camera that took the images.
         settings: settings of the terms.
         parts: indices of the parts of the flesh that are compared with the image; None: all.
-        occluders: indices of the parts that can hide others; None: all.
-        threads: number of threads that share the poses; 0: one per core, see `in_threads`. Results
-            do not depend on this number.
+        occluders: indices of the parts that can hide other parts; None: all.
+        threads: number of threads among which the poses are divided; 0: one per core, see
+            `in_threads`. Results do not depend on this number.
     """
 
     body: Body
@@ -130,8 +130,8 @@ class ImageLikelihood:
         """The keypoint term of an observation, which must have keypoints.
 
         Args:
-            exchanges: log probabilities of exchanges of sides, see `KeypointTerm`; None: those
-                of `usual_exchanges`.
+            exchanges: log probabilities of exchanges of sides, see `KeypointTerm`; None:
+                `usual_exchanges`.
             share: factor on the energy, but not on the prior of the exchanges.
             lifted_share: factor on the energy of lifted poses.
         """
@@ -153,7 +153,7 @@ class ImageLikelihood:
 
     @cached_property
     def priors(self) -> tuple[AnglePrior | MixturePrior | SelfIntersection, ...]:
-        """The terms that need no image: prior of joint angles, and self-intersection."""
+        """The terms independent of images: prior of joint angles, and self-intersection."""
         s = self.settings
         if not np.isfinite(s.self_intersection_sigma):
             return (self.pose_prior,)
@@ -161,16 +161,16 @@ class ImageLikelihood:
 
     @cached_property
     def pose_prior(self) -> AnglePrior | MixturePrior:
-        """The soft prior of the joint angles."""
+        """The prior of the joint angles."""
         s = self.settings
         return pose_prior(self.body, s.pose_prior, s.prior_weight)
 
     def recorded(self, frames: Frames, observation: Observation) -> Array:
-        """The residuals of the image terms at the frames of N poses.
+        """The residuals of the image terms at N poses, given as frames.
 
         Returns:
-            (N, 1 + M, RECORDED): rows 1 to m of a pose are points and derivatives of the residuals;
-            m is the first number of row 0.
+            (N, 1 + M, RECORDED): the first number of row 0 is m; rows 1 to m are points and
+            derivatives of the residuals.
         """
         n = frames.count
         image = observed(self, observation)
@@ -184,7 +184,7 @@ class ImageLikelihood:
 
     @cached_property
     def model(self) -> Model:
-        """Body and camera as the core reads them."""
+        """Body and camera, as inputs of the compiled core."""
         body = self.body
         flesh = flesh_table_of(body)
         count = len(flesh.part_segments)
@@ -203,10 +203,10 @@ class ObservedImage:
     """The image terms of an observation.
 
     Attributes:
-        likelihood: likelihood to which the terms belong.
+        likelihood: likelihood that made the terms.
         observation: evidence of the image.
-        explained: (N, M) or (1, M) maximum energy of each outline sample, because something else
-            may explain the sample; None: unlimited.
+        explained: (N, M) or (1, M) maximum energy of each outline sample, for samples that
+            something else may explain; None: unlimited.
     """
 
     likelihood: ImageLikelihood
@@ -215,7 +215,7 @@ class ObservedImage:
 
     @cached_property
     def compiled(self) -> dict[str, Any]:
-        """The terms as compiled code reads them: fields of `pose_energy.Compiled`."""
+        """The terms as inputs of compiled code: fields of `pose_energy.Compiled`."""
         found = _inputs(self.likelihood.settings, self.observation)
         if self.explained is not None:
             found = found | {
@@ -227,10 +227,10 @@ class ObservedImage:
         return found | {'model': self.likelihood.model}
 
 
-# Cached because an image is compared with many sets of poses, and with parts of the body.
+# Cached, because an image is compared with many sets of poses and with parts of the body.
 @lru_cache(maxsize=4)
 def _inputs(settings: LikelihoodSettings, observation: Observation) -> dict[str, Any]:
-    """The inputs of all terms of an image, whether any is on, and whether any needs the contour."""
+    """The inputs of all image terms, whether any term is on, and whether any needs the contour."""
     beliefs, result = observation.beliefs, []
     for term in TERMS:
         s: TermSettings = getattr(settings, term.name)
@@ -256,13 +256,13 @@ def _inputs(settings: LikelihoodSettings, observation: Observation) -> dict[str,
 def usual_keypoints(
     likelihood: ImageLikelihood, observation: Observation, lifted_share: float
 ) -> KeypointTerm:
-    """The keypoint term with the usual exchanges; repeated calls return the same object."""
+    """The keypoint term with the usual probabilities of exchanges; the result is cached."""
     return likelihood.keypoint_term(observation, usual_exchanges(), 1.0, lifted_share)
 
 
 @lru_cache(maxsize=4)
 def observed(likelihood: ImageLikelihood, observation: Observation) -> ObservedImage:
-    """The image terms of an observation; repeated calls return the same object."""
+    """The image terms of an observation; the result is cached."""
     return ObservedImage(likelihood, observation)
 
 

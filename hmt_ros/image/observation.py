@@ -28,14 +28,15 @@ MARGIN = 48
 
 @dataclass(frozen=True, eq=False)
 class Beliefs:
-    """Probabilities that the cues of an image show the person: factors on their energies.
+    """Probabilities that the cues of an image show the person; factors on the cues' energies.
 
     Attributes:
-        silhouette: probability of the silhouette.
-        keypoints: (G,) probabilities of the groups of keypoints, see `terms.keypoints`.
-        depth: probability of the depths.
-        segments: further factors (S,) on an image term, or on the keypoints, at each segment, by
-            name of the term; without an entry all are 1.
+        silhouette: probability that the silhouette shows the person.
+        keypoints: (G,) probabilities that the groups of keypoints show the person, see
+            `terms.keypoints`.
+        depth: probability that the depths show the person.
+        segments: for image terms and keypoints by name, additional factors (S,) on the energies at
+            each segment; without an entry all factors are 1.
     """
 
     silhouette: float
@@ -54,22 +55,22 @@ class Beliefs:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """An image and the evidence taken from it.
+    """Evidence of one image about a person.
 
     Attributes:
-        silhouette: (H, W) foreground; None if unknown or disbelieved.
+        silhouette: (H, W) foreground; None if unknown, or if it probably does not show the person.
         keypoints: joints seen in the image; None if unknown.
-        evidence: evidence by name of the term; terms without evidence in the image are left out.
-        foreground: (H, W) pixels that differ from the background, even if disbelieved; None:
-            unknown.
-        depths: depth image, m, even if disbelieved; None: unknown.
+        evidence: evidence for each term by name; terms without evidence in the image are left out.
+        foreground: (H, W) pixels that differ from the background, kept even if `silhouette` was
+            rejected; None: unknown.
+        depths: depth image, m, kept even if depths were rejected as evidence; None: unknown.
         flow: optical flow from the previous image, two channels, px; None if missing.
         others: (H, W) pixels that other people cover or possibly cover; None if missing.
-        hidden: (S,) segments hidden by something else, about which the image is no evidence; None
-            if missing.
-        beliefs: probabilities of the cues; None: all are believed.
-        magnification: px/m at the distance of the person; 0 if unknown, so that contours of people
-            are assumed to equal the model's.
+        hidden: (S,) segments hidden by objects, for which the image gives no evidence; None if
+            missing.
+        beliefs: probabilities of the cues; None: all are 1.
+        magnification: px/m at the distance of the person; 0 if unknown: the noise of people's
+            contours is then ignored.
     """
 
     silhouette: Mask | None = None
@@ -108,15 +109,15 @@ def observe(
     depth: NDArray[np.floating] | None = None,
     threads: int = 0,
 ) -> Observation:
-    """The evidence that an image gives to the terms of the likelihood.
+    """Extracts the evidence for the terms of the likelihood from an image.
 
     Args:
         image: (H, W, 3) BGR uint8.
         silhouette: (H, W) foreground; None or empty: the silhouette is not used.
-        window: (left, top, right, bottom) where the person is expected, for images without a
-            silhouette; None: the whole image.
-        last_image: the previous image, of the same size, from which the optical flow starts; None:
-            the flow is not computed.
+        window: box (left, top, right, bottom) that probably contains the person, used if the
+            silhouette is missing; None: the whole image.
+        last_image: the previous image, of the same size, for the optical flow; None: the flow is
+            not computed.
         wanted: names of the terms whose evidence is computed; None: all.
         unsure: (H, W) pixels that possibly belong to the silhouette; None if missing.
         others: (H, W) pixels that other people cover; None if missing.
@@ -124,7 +125,7 @@ def observe(
             range are no evidence.
 
     Raises:
-        ValueError: the image is not (H, W, 3) uint8, or the shapes contradict each other.
+        ValueError: the image is not (H, W, 3) uint8, or shapes are inconsistent.
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         raise ValueError(f'image must be (H, W, 3) uint8, saw {image.shape} {image.dtype}')
@@ -135,7 +136,7 @@ def observe(
     known = silhouette if silhouette is not None and silhouette.any() else None
     box = window
     if known is not None:
-        # The person can be anywhere behind the other people.
+        # The person can be anywhere behind other people.
         box = _box(known if others is None else known | others)
     left, top, right, bottom = _grown(box, MARGIN, image.shape)
     inside = slice(top, bottom), slice(left, right)

@@ -3,8 +3,8 @@
     E(x) = w / Q sum_q rho(|u_q(x) - p_q - f(p_q)| / (sigma + 0.15 |f(p_q)|))
 
 Q points of the surface were seen at pixels p_q of the previous image; the pose x moves them to
-u_q(x), and f is the flow (`core/flow.h`). The term improves the predictions of modes. It can not
-compare modes, because each mode has its own points.
+u_q(x), and f is the flow (`core/flow.h`). The term improves predictions of modes. Its values can
+not be compared between modes, because each mode has its own points.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MIN_IMAGE_SIDE = 32
 
 
 def optical_flow(window: ImageWindow) -> ImageMap | None:
-    """Dense flow from the last image to this one, two channels, px [Kroeger et al., ECCV 2016].
+    """Dense flow, two channels, px, from the previous image [Kroeger et al., ECCV 2016].
 
     NaN on pixels of other people; None if there is no previous image.
     """
@@ -35,7 +35,7 @@ def optical_flow(window: ImageWindow) -> ImageMap | None:
     grey = [cv2.cvtColor(x, cv2.COLOR_BGR2GRAY) for x in (window.last_image, window.image)]
     if min(grey[0].shape) < MIN_IMAGE_SIDE:
         return window.as_map(np.zeros((2, *grey[0].shape), np.float32))
-    # The type stubs do not allow None as initial flow.
+    # OpenCV accepts None as initial flow, but the type stubs do not.
     method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     with without_ipp():
         flow = method.calc(grey[0], grey[1], None)
@@ -48,7 +48,7 @@ def optical_flow(window: ImageWindow) -> ImageMap | None:
 
 @contextmanager
 def without_ipp() -> Iterator[None]:
-    """Disable Intel's IPP in OpenCV, whose resizing depends on the processor, in this thread."""
+    """Disable Intel's IPP in OpenCV in this thread: IPP's resizing depends on the processor."""
     before = cv2.ipp.useIPP()
     cv2.ipp.setUseIPP(False)
     try:
@@ -59,11 +59,11 @@ def without_ipp() -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class FlowTerm:
-    """The energy of poses against the flow.
+    """The energy of poses against the optical flow.
 
     Attributes:
         points: surface points of K poses in the previous image, one pose per problem.
-        flow: flow from the previous image to this one.
+        flow: flow from the previous image to this image.
         weight: w, number of independent measurements.
     """
 
@@ -73,5 +73,5 @@ class FlowTerm:
 
     @property
     def compiled(self) -> tuple[SurfacePoints, ImageMap, float]:
-        """The term as compiled code reads it."""
+        """The term as input of the compiled core."""
         return self.points, self.flow, self.weight

@@ -1,4 +1,4 @@
-"""The colours of a person, whether an image shows them, and whether the person has moved.
+"""The colours of a person: whether an image contains them, and whether the person has moved.
 
     p(M | colour) = h_M / (h_M + h_around)              ratio of two histograms
     B(x) = mean of p(M | colour) over a box at x        as large as the model
@@ -7,16 +7,17 @@
 M are the pixels that the model covers. `here` is the usual value of B at the person, and
 `elsewhere` the usual maximum of B over boxes that do not touch the person. The score is near 1 if
 somebody in these colours is anywhere in the image, and near 0 in a room without the person. Colours
-are no evidence if the two values are similar, or if the image has other colours than earlier
-images, because the lens is covered or the light has changed.
+are not used as evidence if `here` and `elsewhere` are similar, or if most colours differ from
+earlier images, because the lens is covered or the light has changed.
 
-Missing colours are evidence against the person only in the scene in which they were learned:
+Missing colours are evidence against the person only if the scene has not changed since the colours
+were learned:
 
-    stillness = 1 - changed pixels beyond the model / (LARGEST_CHANGE pixels of the model), >= 0
+    stillness = 1 - changed pixels beyond the model / (MAX_CHANGE pixels of the model), >= 0
 
-After a change, such as a movement of the camera, `elsewhere` is from another scene, and the lost
-colours may be from an object that the model covered. A person who moves out of the model changes as
-many pixels. A colour that no earlier image had may belong to a person who has turned around.
+After a change of the scene, such as a movement of the camera, `elsewhere` is no longer valid, and
+the missing colours may be from an object that the model covered. Stillness is also low after the
+person has moved out of the model. A new colour may belong to a person who has turned around.
 """
 
 from __future__ import annotations
@@ -32,23 +33,23 @@ from hmt_ros.core import bin_colours, count_colours, elementary
 from hmt_ros.image.person_shape import counted
 from hmt_ros.inference.arrays import Array, Image, Mask
 
-# Time constant of the usual values of a person, s.
+# Time constant of the means over learned images, s.
 MEMORY_TIME = 2.0
 # Interval between updates of the colours, which hardly change, s.
 LEARNING_INTERVAL = 0.1
-# Changed pixels beyond the model that mean another scene, as a fraction of the pixels not beyond it
-# or, if fewer, of all pixels beyond it. It allows for the person's shadow.
+# Changed pixels beyond the model at which the scene counts as changed, as a fraction of all pixels
+# beyond the model or, if fewer, of all others. The limit allows for the person's shadow.
 MAX_CHANGE = 0.25
 # Minimum difference between the probabilities `here` and `elsewhere` for colours to be evidence.
 MIN_CONTRAST = 0.15
 # Number of bins of a colour channel with values from 0 to 255.
 BINS = 8
-# Minimum changed pixels if the person moves, and maximum if nothing moves, as a fraction of the
-# model's pixels.
+# Changed pixels above which the person has moved, and below which nothing has moved, as fractions
+# of the model's pixels.
 MOVED_FRACTION, UNMOVED_FRACTION = 0.03, 0.005
 # Minimum ratio of the density of changed pixels on a moving person to the density elsewhere.
 MOTION_DENSITY_RATIO = 8.0
-# Minimum standard deviation of the model's pixels for its motion to be visible, grey levels.
+# Minimum standard deviation of the model's pixels at which motion is visible, grey levels.
 MIN_MODEL_CONTRAST = 4.0
 # Difference of a channel above which a pixel has changed, grey levels; larger than the noise of
 # means over 3 x 3 pixels of the raster.
@@ -59,8 +60,8 @@ class Motion(NamedTuple):
     """Changes since the last learned image.
 
     Attributes:
-        moved: whether the pixels of the model have changed, and the rest of the image has not.
-        still: whether nothing has changed, so that the person is still there.
+        moved: whether pixels of the model have changed, while the rest of the image has not.
+        still: whether nothing has changed, so that the person has not moved.
     """
 
     moved: bool
@@ -72,8 +73,8 @@ class Colours:
 
     Attributes:
         size: (width, height) of the model, px of the raster.
-        here, elsewhere: usual mean of p(M | colour) over a box at the person, and maximum of this
-            mean over boxes that do not touch the person; NaN if unknown.
+        here, elsewhere: usual mean of p(M | colour) over a box at the person, and usual maximum of
+            such means over boxes that do not touch the person; NaN if unknown.
     """
 
     def __init__(self) -> None:
@@ -90,13 +91,13 @@ class Colours:
 
         Args:
             image: image on the raster.
-            unseen: p(M | colour) for colours that no learned image had.
+            unseen: value of p(M | colour) for colours that are in no learned image.
         """
         contrast = self.here - self.elsewhere
         if self._inside is None or not contrast >= MIN_CONTRAST:
             return None
         bins = binned(image)
-        if np.minimum(shares(bins), self._scene).sum() < 0.5:  # most of the image has other colours
+        if np.minimum(shares(bins), self._scene).sum() < 0.5:  # most of the image has new colours
             return None
         return float((self._means(bins, unseen).max() - self.elsewhere) / contrast)
 
@@ -139,7 +140,7 @@ class Colours:
         if not model.any() or not around.any():
             return
         bins = binned(image)
-        # One pass counts the pixels on the model, around it, and all others.
+        # One pass counts the pixels on the model, around the model, and elsewhere.
         counts = np.empty((3, BINS**3), np.int64)
         count_colours(bins, model + 2 * around.view(np.uint8), counts)
         on, off = (x / max(x.sum(), 1) for x in counts[1:])
@@ -164,9 +165,9 @@ class Colours:
             self.elsewhere = _moved(self.elsewhere, elsewhere, gain)
 
     def _means(self, bins: NDArray[np.uint16], unseen: float = 0.0) -> NDArray[np.float32]:
-        """Mean of p(M | colour) over a box at each pixel (h, w); outside the image it is 0."""
+        """Mean of p(M | colour) over a box at each pixel (h, w); 0 is used outside the image."""
         assert self._inside is not None
-        # A colour with less than a pixel is counted neither for the person nor the surroundings.
+        # The added share of one pixel keeps the ratio of very rare colours near 0.
         whole = self._inside + self._around + 1.0 / bins.size
         ratio = (self._inside / whole).astype(np.float32)
         if unseen:
@@ -181,7 +182,7 @@ def _moved(usual: float, value: float, gain: float) -> float:
 
 
 def binned(image: Image) -> NDArray[np.uint16]:
-    """The bin of the colour of each pixel (h, w) of an image (h, w, 3)."""
+    """Colour bins (h, w) of the pixels of an image (h, w, 3)."""
     result = np.empty(image.shape[:2], np.uint16)
     bin_colours(np.ascontiguousarray(image), BINS, result)
     return result
@@ -195,10 +196,10 @@ def shares(bins: NDArray[np.uint16]) -> Array:
 
 
 def surroundings(model: Mask, outside: Mask) -> Mask:
-    """Pixels (H, W) around the model, at a distance of up to half its size.
+    """Pixels (H, W) around the model, up to a distance of half the model's size.
 
     Args:
-        model, outside: pixels of the model, and pixels beyond it, see `beyond`.
+        model, outside: pixels of the model, and the result of `beyond` for this model.
     """
     x, y, width, height = cv2.boundingRect(model.view(np.uint8))
     margin = max(width, height) // 2
@@ -210,7 +211,7 @@ def surroundings(model: Mask, outside: Mask) -> Mask:
 
 
 def beyond(model: Mask) -> Mask:
-    """Pixels (H, W) at a distance from the model of more than a tenth of its size."""
+    """Pixels (H, W) farther from the model than a tenth of the model's size."""
     *_, width, height = cv2.boundingRect(model.view(np.uint8))
     near = max(max(width, height) // 10, 1)
     size = (2 * near + 1, 2 * near + 1)

@@ -1,4 +1,4 @@
-"""Area of a person in an image, and pieces of a silhouette with the shape of a person."""
+"""Area of a person in an image, and pieces of a silhouette that have the shape of a person."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Piece(NamedTuple):
     """A piece of a silhouette that has the shape of one person.
 
     Attributes:
-        area: number of pixels of the image.
+        area: area of the piece, px of the full image.
         cut: whether the piece touches the left or right border of the image, which may cut it.
     """
 
@@ -36,7 +36,7 @@ class Piece(NamedTuple):
 
 
 def raster_step(height: int) -> int:
-    """Step of the raster in pixels of an image of this height."""
+    """Step of the coarse raster, px, for an image of this height."""
     return max(round(height / RASTER_HEIGHT), 1)
 
 
@@ -50,12 +50,12 @@ def on_raster(image: NDArray[Any], raster: Mask) -> NDArray[Any]:
 def largest_person(foreground: Mask, step: int = 1) -> Piece | None:
     """The largest piece of a foreground that has the shape of one person; None if missing.
 
-    A piece is connected, or is the largest piece together with pieces near it, because clothes in
-    the colours of the room leave gaps.
+    A piece is either connected, or the largest piece together with nearby pieces, because clothes
+    in the colours of the room leave gaps.
 
     Args:
         foreground: (h, w) mask.
-        step: step between pixels of the mask in the image, px.
+        step: distance in the image between neighbouring pixels of the mask, px.
     """
     x, y, across, down = cv2.boundingRect(foreground.view(np.uint8))
     if across == 0:
@@ -90,7 +90,7 @@ def looks_like_person(silhouette: Mask) -> bool:
 
 
 def covered(body: Body, camera: Camera, pose: Array, step: int = 1) -> Mask:
-    """Every step-th pixel (H / step, W / step) that a body covers at a pose (d,).
+    """Mask (H / step, W / step) of every step-th pixel: whether a body in a pose (d,) covers it.
 
     Each part of the flesh is drawn as the convex hull of its projected points.
     """
@@ -99,7 +99,7 @@ def covered(body: Body, camera: Camera, pose: Array, step: int = 1) -> Mask:
     corners = len(mesh.vertices) // max(parts, 1)
     pixels = camera.project(places.reshape(parts, corners, 3)) / step
     mask = np.zeros((-(-camera.height // step), -(-camera.width // step)), dtype=np.uint8)
-    # A part that is partly behind the camera has no hull.
+    # Skip parts that are partly behind the camera.
     for hull in map(cv2.convexHull, _corners(mask, pixels[np.isfinite(pixels).all((1, 2))])):
         cv2.fillConvexPoly(mask, hull, 1)
     return mask.view(np.bool_)

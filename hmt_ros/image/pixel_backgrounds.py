@@ -1,7 +1,7 @@
-"""Models of the empty scene, pixel by pixel: the interface, and the two models of OpenCV.
+"""Per-pixel models of the empty scene: the interface, and OpenCV's two models.
 
-A new model needs a file in this folder with a class of the interface, and a line in the table
-`BACKGROUNDS` of `background`.
+A new model needs a file in this folder with a class that has the interface, and a line in
+`background.BACKGROUNDS`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ FOREGROUND_LABEL, SHADOW_LABEL = 255, 127
 class Background(Protocol):
     """A model of the empty scene that labels the pixels of an image.
 
-    `BACKGROUNDS` makes a model without images from `threshold` and `shadow_threshold` of
-    `BackgroundSettings`. The same images give the same labels.
+    The constructors in `BACKGROUNDS` get `threshold` and `shadow_threshold` of
+    `BackgroundSettings`. A model is deterministic: the same images give the same labels.
 
     Attributes:
-        repeats: number of times to learn an image if it is the only image.
-        empty: (h, w, 3) the empty scene, as far as it is known.
+        repeats: number of times that an image must be learned if it is the only one.
+        empty: (h, w, 3) current estimate of the empty scene.
     """
 
     repeats: int
@@ -40,7 +40,8 @@ class Background(Protocol):
         """Adds an image (h, w, 3) of the scene to the model.
 
         Args:
-            share: weight of the image relative to all images so far, above 0; 1 for the first.
+            share: weight of the image relative to all images so far, above 0; 1 for the first
+                image.
         """
         ...
 
@@ -53,7 +54,7 @@ class OpenCvBackground:
     """A background model of OpenCV; see `Background`.
 
     Args:
-        model: a model that has seen no image.
+        model: a new model of OpenCV.
         frozen: learning rate at which the model does not change.
         repeats: see `Background`.
         shadow_threshold: as in `BackgroundSettings`.
@@ -86,13 +87,13 @@ class OpenCvBackground:
 
 
 def mixture_background(threshold: float, shadow_threshold: float) -> Background:
-    """A mixture of Gaussians for each pixel: MOG2."""
+    """Background model with a mixture of Gaussians for each pixel (MOG2)."""
     model = cv2.createBackgroundSubtractorMOG2(varThreshold=threshold)
     return OpenCvBackground(model, 0.0, 1, shadow_threshold)
 
 
 def neighbour_background(threshold: float, shadow_threshold: float) -> Background:
-    """The nearest neighbours among samples of each pixel: KNN."""
+    """Background model with the nearest neighbours among samples of each pixel (KNN)."""
     model = cv2.createBackgroundSubtractorKNN(dist2Threshold=20.0 * threshold)
     # At a learning rate of 0 the model would replace its samples immediately.
     return OpenCvBackground(model, 1e-7, 20, shadow_threshold)

@@ -1,11 +1,12 @@
-"""Energies of poses and their minima: all terms of one image in one pass of the compiled core.
+"""Energies of poses and their minima; the core evaluates all terms of an image in one pass.
 
     E(x) = E_image(x) + E_keypoints(x) + E_prior(x) + E_intersection(x) + E_ground(x) + E_flow(x)
            + E_motion(x)
 
-The frames of a pose are computed once, and all terms in `core/terms` read them. The core minimises
-as `inference.bounded_newton` does, but each problem on its own instead of all in common steps. The
-`energy` of a term that is not in the core is added; `bounded_newton` then finds the minima.
+The frames of a pose are computed once and used by all terms in `core/terms`. The core minimises
+with the algorithm of `inference.bounded_newton`, but problem by problem instead of all problems in
+common steps. If a term is not in the core, its `energy` is added, and `bounded_newton` finds the
+minima.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ CompiledTerm = (
 
 # Length of a moderate step of an angle, rad, and of a position, m.
 ROTATION_STEP, PLACE_STEP = 0.4, 0.3
-# Initial damping of a minimisation, and decrease in a step below which it ends, nats.
+# Initial damping of a minimisation, and decrease in a step below which the minimisation ends, nats.
 DAMPING, TOLERANCE = 1.0, 1e-3
 # Default maximum number of steps of a minimisation.
 MAX_ITERATIONS = 40
@@ -63,15 +64,15 @@ def scale_of(body: Body) -> Array:
 
 
 class Compiled(NamedTuple):
-    """The terms as compiled code reads them; an absent term contributes 0.
+    """The terms as inputs of the compiled core; an absent term contributes 0.
 
     Attributes:
         placing: constants of the skeleton.
-        model, inputs: inputs of the terms of the image.
+        model, inputs: inputs of the image terms.
         image, contour: whether an image term is on, and whether such a term needs the contour.
         keypoints, prior, overlaps, ground, flow: inputs of the other terms.
-        centres, precisions: (R, f), (R, f, f) of the motion prior, one row per problem or one for
-            all; (0, f), (0, f, f) without a motion prior.
+        centres, precisions: (R, f), (R, f, f) centres and precisions of the motion prior, one row
+            per problem or a single row; (0, f), (0, f, f) without a motion prior.
         tails: degrees of freedom of the motion prior; 0 if it is Gaussian.
     """
 
@@ -94,8 +95,9 @@ class Descent(NamedTuple):
     """Settings of the minimiser; see `bounded_newton.minimise`.
 
     Attributes:
-        most: maximum number of evaluations per problem after the first one.
-        damping, tolerance: initial lambda, and decrease in a step below which a descent ends.
+        most: maximum number of evaluations per problem in addition to the first.
+        damping, tolerance: initial damping lambda, and decrease in a step below which the descent
+            ends.
         scale: (d,) length of a moderate step of each variable.
     """
 
@@ -116,7 +118,7 @@ class ByCue:
     Attributes:
         energy: sum over the sources.
         values: (n, 3) energy of each source.
-        hessians: (n, 3, d, d) of each source; (0, 3, d, d) if they were not requested.
+        hessians: (n, 3, d, d) Hessian of each source; (0, 3, d, d) if not requested.
         outline_costs: (n, M) energy of each sample of the silhouette's outline.
     """
 
@@ -128,20 +130,22 @@ class ByCue:
 
 @dataclass(frozen=True, eq=False)
 class PoseEnergy:
-    """A sum of terms over the poses of a body; an `EnergyTerm` over all variables or some of them.
+    """Sum of the terms of a body's pose; an `EnergyTerm` over all or some of the pose variables.
 
     Attributes:
         likelihood: image likelihood of the body.
-        terms: terms that read the frames of a pose, at most one of each kind that has a kernel.
+        terms: terms that are functions of the frames of a pose; at most one of each kind with a
+            compiled kernel.
         motion: motion prior of the free variables, around the expected poses; None if missing.
-        point: (d,) values of all variables; None: all are free.
-        free: (f,) indices of the variables that may move, if `point` is given.
-        counted: called with the number of poses that were evaluated; None: not called.
+        point: (d,) values of the variables, used for the fixed variables; None: all variables are
+            free.
+        free: (f,) indices of the variables that are free if `point` is given.
+        counted: function called with the number of evaluated poses; None: not called.
         _own: terms with a compiled kernel, without the motion prior.
         _strange: terms without a compiled kernel.
 
     Raises:
-        ValueError: two terms with a kernel are of the same kind.
+        ValueError: two terms with a compiled kernel are of the same kind.
     """
 
     likelihood: ImageLikelihood
@@ -168,7 +172,7 @@ class PoseEnergy:
     ) -> Energy:
         """The energy at values x (n, f) of the free variables; see `EnergyTerm`.
 
-        Without rows, point i belongs to problem i.
+        If `rows` is None, point i belongs to problem i.
 
         Raises:
             ValueError: x does not have f columns, or is not finite.
@@ -180,7 +184,7 @@ class PoseEnergy:
         return self.energy(x, derivatives=Derivatives.NONE).value
 
     def by_cue(self, x: Array, *, derivatives: bool = True) -> ByCue:
-        """The energy at poses x (n, d), cue by cue; pose i belongs to problem i.
+        """The energy at poses x (n, d), split by cue; pose i belongs to problem i.
 
         Raises:
             ValueError: some variables are fixed, there is a motion prior, or `energy` would fail.
@@ -225,7 +229,7 @@ class PoseEnergy:
 
         Args:
             x: (n, f) initial values of the free variables.
-            step_scale: (d,) or scalar length of a moderate step; None: `scale_of` the body.
+            step_scale: (d,) or scalar length of a moderate step; None: the result of `scale_of`.
             damping, max_iterations, tolerance: as for `bounded_newton.minimise`.
 
         Raises:
@@ -267,14 +271,14 @@ class PoseEnergy:
     ) -> tuple[
         Energy, tuple[Array, Array, Array], NDArray[np.int8], NDArray[np.int32], NDArray[np.bool_]
     ]:
-        """Energies at points x (n, f), or minima, which are written to x; results as for `solve`.
+        """Energies at points x (n, f), or at minima, which overwrite x; outputs as for `solve`.
 
         Args:
             rows: (n,) problem of each point; None: point i belongs to problem i.
-            descent: settings of the minimiser; with `NO_DESCENT` the points stay.
-            together: number of points in a block of work for a thread.
-            wanted: whether derivatives are wanted.
-            apart: whether values and Hessians of each cue, and outline costs, are wanted.
+            descent: settings of the minimiser; with `NO_DESCENT` the points are only evaluated.
+            together: number of points that a thread processes at a time.
+            wanted: whether to compute derivatives.
+            apart: whether to compute values and Hessians of each cue, and outline costs.
         """
         n, f = x.shape
         asked, values = n if wanted else 0, n if apart else 0
@@ -329,7 +333,7 @@ class PoseEnergy:
 
     @cached_property
     def _compiled(self) -> Compiled:
-        """The terms as compiled code reads them, without a buffer for outline costs."""
+        """The terms as inputs of the core, without a buffer for outline costs."""
         known = self._own
         if self.motion is not None:
             centres, precisions, tails = _expected(self.motion)
@@ -343,7 +347,7 @@ class PoseEnergy:
 # Cached because an image is compared with many sets of poses.
 @lru_cache(maxsize=8)
 def _summed(likelihood: ImageLikelihood, terms: tuple[CompiledTerm | FrameTerm, ...]) -> Compiled:
-    """Terms with a compiled kernel, as compiled code reads them.
+    """Terms with a compiled kernel, as inputs of the core.
 
     Raises:
         ValueError: two terms are of the same kind.
@@ -361,7 +365,7 @@ def _summed(likelihood: ImageLikelihood, terms: tuple[CompiledTerm | FrameTerm, 
 
 
 def _with_costs(compiled: Compiled, poses: int) -> tuple[Compiled, Array]:
-    """The terms with a buffer for the energies (N, M) of outline samples, and this buffer."""
+    """The terms with a buffer for the energies (N, M) of outline samples, and the buffer itself."""
     inputs, costs = list(compiled.inputs), np.zeros((poses, 0))
     for i, own in enumerate(inputs):
         if hasattr(own, 'costs'):
@@ -415,7 +419,7 @@ def _every_variable(body: Body) -> Index:
 
 @lru_cache(maxsize=16)
 def _absent(body: Body) -> Compiled:
-    """Inputs of compiled code if all terms are absent."""
+    """Inputs of the compiled core if all terms are absent."""
     camera = Camera(1.0, 1.0, 0.0, 0.0, 1, 1)
     none, nothing = np.zeros(0, np.int64), np.zeros((0, 0, 3))
     no_keypoints = Keypoints((), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))

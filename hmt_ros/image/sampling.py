@@ -1,4 +1,4 @@
-"""Image maps, from which `core/sampling.h` interpolates bilinear values and gradients."""
+"""Image maps, in which `core/sampling.h` interpolates values and gradients bilinearly."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 class ImageMap(NamedTuple):
-    """Values in one or several channels on a window of the pixel grid.
+    """Values on a window of the pixel grid, in one or several channels.
 
     Attributes:
         values: (C, h, w) float32, h and w at least 2.

@@ -1,14 +1,16 @@
-"""Source of the silhouette of an image, and check of the background.
+"""Silhouettes from a segmenter or from background subtraction, and checks of the background.
 
 The mask of a segmenter is used if available. Otherwise the background is subtracted, as soon as the
 scene is known to be empty (`EmptyScene`). When a track starts from joints, the pose is known, and
+the fraction
 
     f = |foreground and area of the body| / |area of the body|
 
-is near 1 if the background is the empty scene, and less for clothes in the colours of the room.
-Below `MIN_FOREGROUND_FRACTION` a learned background is forgotten. It is rebuilt from pixels of
-later images that no mode of the posterior covers with the person; cues other than silhouettes
-locate the person. Until the background around the person is known, tracking uses no silhouettes.
+is near 1 if the background is the empty scene, and lower for clothes in the colours of the room. If
+f is below `MIN_FOREGROUND_FRACTION`, a learned background is forgotten. It is rebuilt from those
+pixels of later images that the person covers in no mode of the posterior; cues other than
+silhouettes then locate the person. No silhouettes are used until the background around the person
+is known.
 """
 
 from __future__ import annotations
@@ -27,18 +29,19 @@ from hmt_ros.image.observation import Box
 from hmt_ros.image.person_shape import resized
 from hmt_ros.inference.arrays import Array, Image, Mask
 
-# Shift of the still scene, px, above which a background belongs to another view.
+# Image shift of a stationary scene above which the background is of another view, px.
 VIEW_SHIFT = 2.0
-# Minimum foreground fraction of the person for the background to count as empty.
+# Foreground fraction of the person's area below which a learned background is rejected.
 MIN_FOREGROUND_FRACTION = 0.35
 # Log odds of a person in a background that was rebuilt without people, nats.
 COMPLETED_LOG_ODDS = -6.0
-# Margins of the area of a body, as a fraction of its height: inwards for pixels that certainly show
-# the person, outwards for pixels that possibly do.
+# Margins of a body's area, as fractions of the area's height: inwards for pixels that certainly
+# show the person, outwards for pixels that possibly show the person.
 INNER_MARGIN, OUTER_MARGIN = 0.01, 0.06
 # Maximum unknown fraction of the person's area for silhouettes to be used.
 MAX_UNKNOWN_FRACTION = 0.02
-# Margin of a silhouette around all joints of all modes, as a fraction of the joints' extent.
+# Margin of the box that can contain the person around the joints of all modes, as a fraction of the
+# joints' extent.
 REGION_MARGIN = 0.3
 
 
@@ -46,11 +49,11 @@ class Silhouettes:
     """The silhouettes of one person in the images of one camera.
 
     Args:
-        background: background model, of the empty scene or without any image so far.
-        shared: whether other people share the background, which is then learned elsewhere.
+        background: background model, either of the empty scene or without images.
+        shared: whether several people share the background; other code then learns it.
 
     Attributes:
-        scene: the empty scene, as far as it is known.
+        scene: model of the empty scene.
         watch: detects whether the camera has moved since the background was taken.
         doubted: whether the background shows the person and has not been rebuilt yet.
     """
@@ -65,12 +68,12 @@ class Silhouettes:
 
     @property
     def background(self) -> BackgroundModel:
-        """The empty scene, as far as it is known."""
+        """Model of the empty scene; parts can be unknown."""
         return self.scene.background
 
     @property
     def known(self) -> str:
-        """State of the background, in a few words."""
+        """State of the background, as a short text for users."""
         unknown = self.background.unknown
         if unknown is not None:
             return f'forgotten, {1 - unknown.mean():.0%} known again'
@@ -79,7 +82,7 @@ class Silhouettes:
         return 'not yet seen empty' if self.background.frames else 'unknown'
 
     def forget(self) -> None:
-        """Restarts without a background, because the camera sees another scene."""
+        """Discards the background, because the camera sees another scene."""
         self.scene = EmptyScene(BackgroundModel(self.background.settings), trusted=self._shared)
         self.doubted, self._learning = False, not self._shared
         self.watch = SceneWatch()
@@ -112,9 +115,9 @@ class Silhouettes:
         Args:
             image: (H, W, 3).
             stamp: stamp of the image, ns.
-            mask: (H, W) mask from a segmenter, if any.
+            mask: (H, W) mask from a segmenter; None if missing.
             region: box that can contain the person; None: the whole image.
-            others: (H, W) pixels that somebody else covers; None if missing.
+            others: (H, W) pixels that other people cover; None if missing.
         """
         if mask is not None:
             mask = mask if others is None else mask & ~others
@@ -130,7 +133,7 @@ class Silhouettes:
         return self.background.split(image, region, others) if scene.known else None
 
     def anywhere(self, image: Image, mask: Mask | None, others: Mask | None, step: int) -> Mask:
-        """All foreground of an image, at every step-th pixel (H / step, W / step).
+        """The whole foreground of an image, at every step-th pixel (H / step, W / step).
 
         Args:
             image, mask, others: as for `silhouette`, whose result must not be None.
@@ -145,9 +148,9 @@ class Silhouettes:
         return np.asarray(cv2.medianBlur(pixels, 3), dtype=np.uint8).view(np.bool_)
 
     def check(self, image: Image, body: Body, camera: Camera, poses: Array) -> None:
-        """Forgets a background in which too little of the person, in poses (K, d), is foreground.
+        """Forgets the background if too little of the person, in poses (K, d), is foreground.
 
-        A background that was given instead of learned is trusted to be the empty scene.
+        A given background, which was not learned, is assumed to be the empty scene.
         """
         if not self.background.frames or not self._learning:
             return
@@ -180,12 +183,12 @@ class Silhouettes:
 def region_of(
     body: Body, camera: Camera, poses: Array, margin: float = REGION_MARGIN, dt: float = 0.0
 ) -> Box | None:
-    """Box that can contain a person in poses (K, d) in the next image; None if anywhere.
+    """Box that can contain a person in the next image, given poses (K, d); None: anywhere.
 
     Args:
-        body, camera, poses: body and poses of the person, and the camera.
+        body, camera, poses: body of the person, camera, and (K, d) earlier poses.
         margin: margin around all joints, as a fraction of their extent.
-        dt: time since the person was at the poses, s.
+        dt: time since the image of these poses, s.
     """
     pixels = camera.project(body.joint_positions(poses)).reshape(-1, 2)
     pixels = pixels[np.isfinite(pixels).all(1)]

@@ -1,7 +1,7 @@
-"""Detects that images do not change around keypoints, which are then not those of a person.
+"""Detects images without change around keypoints, which then do not belong to a person.
 
-A detector that takes the foot of a table for a person does so in every image of the same scene.
-People always move a little.
+If a detector takes the foot of a table for a person, it does so in every image of the scene.
+People, however, always move a little.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ BLUR_SIGMA, MIN_LEVEL_CHANGE, MIN_MOVING_FRACTION, MIN_CONTRAST = 1.5, 10.0, 0.0
 
 
 class StillPicture:
-    """Keeps the last image that had changed around the keypoints."""
+    """Compares images around keypoints with the last image in which this region had changed."""
 
     def __init__(self) -> None:
         self._last: NDArray[np.float32] | None = None
 
     def shows_again(self, image: Image, keypoints: Keypoints) -> bool:
-        """Whether an image equals the kept one around keypoints; if not, keeps the new image.
+        """Whether an image equals the stored image around keypoints; if not, stores the new image.
 
         Args:
             image: (H, W, 3) BGR.
-            keypoints: keypoints, of which at least one was seen.
+            keypoints: keypoints in the image, at least one of them seen.
         """
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         picture = cv2.GaussianBlur(grey, (0, 0), BLUR_SIGMA).astype(np.float32)

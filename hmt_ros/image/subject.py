@@ -19,18 +19,18 @@ KEYS = ('stamp_ns', 'sigma_px', 'keypoints', 'segment_lengths_m', 'stature_m')
 
 
 class SubjectError(ValueError):
-    """A subject file cannot be used; the message, of one line, gives seen and wanted content."""
+    """A subject file is invalid; the one-line message gives actual and expected content."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """The content of a subject file, from which a track starts.
+    """Content of a subject file, from which a track can start.
 
     Attributes:
         stamp_ns: stamp of the image in which the joints were seen, ns.
-        keypoints: the joints as keypoints.
+        keypoints: keypoints at the person's joints.
         segment_lengths: measured lengths by name, m.
-        stature: stature, m; None if unknown.
+        stature: height of the person, m; None if unknown.
     """
 
     stamp_ns: int
@@ -56,10 +56,10 @@ def read_subject(path: str | Path, body: Body) -> Subject:
 
 
 def parse_subject(content: Any, body: Body) -> Subject:
-    """The subject that the content of a subject file describes.
+    """Makes the subject from the content of a subject file.
 
     Raises:
-        SubjectError: as `read_subject`.
+        SubjectError: as for `read_subject`, except missing files.
     """
     if not isinstance(content, dict):
         raise SubjectError(f'wanted entries {list(KEYS)}, saw {type(content).__name__}')
@@ -108,7 +108,7 @@ def _positive(value: Any, name: str, largest: float = MAX_PIXEL) -> float:
 
 
 def _length(value: Any, name: str, signed: bool) -> float:
-    """Checks a length, m; a signed length, such as an offset, can be negative."""
+    """Checks a length, m; signed lengths, such as offsets, can be negative."""
     if not signed:
         return _positive(value, f'length {name}', MAX_LENGTH)
     if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= MAX_LENGTH:

@@ -1,7 +1,8 @@
-"""The occluding contour in the image, and its visible points, as the compiled core reads them.
+"""Occluding contour of the flesh in the image: inputs and outputs of the compiled core.
 
-`core/surface.h` traces the contour pose by pose, as `body.flesh` and `Camera.project` do: on every
-ring of the flesh it consists of the two points whose normal is perpendicular to the viewing ray.
+`core/surface.h` traces the contour pose by pose, with the geometry of `body.flesh` and
+`Camera.project`. On every ring of the flesh, the contour has the two points whose normal is
+perpendicular to the viewing ray.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ Ints = NDArray[np.int64]
 
 
 class FleshTable(NamedTuple):
-    """The flesh as the compiled code reads it: parts (B,), and rings (R,) of `flesh.Rings`.
+    """The flesh as input of the compiled core: parts (B,), and rings (R,) of `flesh.Rings`.
 
-    `ring_noise` (R, 2) is the standard deviation between contours of people and of the model, at
+    `ring_noise` (R, 2) is the standard deviation of people's contours from the model's contour, at
     the sides and in front or behind, m; see `contour_noise.yaml`.
     """
 
@@ -44,14 +45,14 @@ class Contour(NamedTuple):
 
     Attributes:
         parts: (P,) part of the flesh of each point.
-        points: (P, 3) camera frame, m.
+        points: (P, 3) positions in the camera frame, m.
         pixels: (P, 2) projections of the points.
         projections: (P, 2, 3) derivative of the pixels with respect to the points.
         normals: (P, 2) outward normals in the image.
         valid: (P,) whether the point exists and lies in front of the camera.
         covered: (P,) whether another part lies on the same ray, in front or behind.
         hidden: (P,) whether another part lies on the same ray, in front.
-        noise: (P,) standard deviation between contours of people and the point, m.
+        noise: (P,) standard deviation of people's contours from the point, m.
     """
 
     parts: Ints
@@ -67,7 +68,7 @@ class Contour(NamedTuple):
 
 @lru_cache(maxsize=16)
 def flesh_table_of(body: Body) -> FleshTable:
-    """The flesh of a body as the compiled code reads it."""
+    """The flesh of a body as input of the compiled core."""
     flesh, ring = body.flesh, body.flesh.rings
     return FleshTable(
         np.array([p.segment for p in flesh.parts], dtype=np.int64),
@@ -91,7 +92,7 @@ def _noise_of_parts() -> dict[str, list[float]]:
 
 
 def _contour_noise(body: Body) -> Array:
-    """Standard deviations (B, 2) of contours at the sides and in front of each part, m."""
+    """Standard deviations (B, 2) of people's contours at the sides and in front of parts, m."""
     known, names = _noise_of_parts(), body.skeleton.segment_names
     plain = [names[p.segment].removeprefix('left_').removeprefix('right_') for p in body.shapes]
     return np.array([known.get(name, known['other']) for name in plain]).reshape(-1, 2)

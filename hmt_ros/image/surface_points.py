@@ -1,4 +1,4 @@
-"""Points of the body's surface that a camera sees at a pose, for flow and silhouette."""
+"""Points of the body's surface that are visible at a pose, for flow and silhouette."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class SurfacePoints(NamedTuple):
     """Up to Q points on the visible surface of each of K poses.
 
     Attributes:
-        counts: (K,) number of points of each pose; further entries of its row are not used.
+        counts: (K,) number of points of each pose; later entries in the pose's row are unused.
         segments: (K, Q) segments on which the points lie.
         local: (K, Q, 3) positions of the points in the frames of the segments, m.
         pixels: (K, Q, 2) projections of the points, px.
@@ -39,7 +39,7 @@ def seen_points(
 ) -> SurfacePoints:
     """Points of the surface visible at K poses.
 
-    They are spread evenly over the visible vertices of a coarse mesh, without random choice.
+    The points are spread evenly over the visible vertices of a coarse mesh; nothing is random.
 
     Args:
         body: body with flesh.

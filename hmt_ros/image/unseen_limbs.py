@@ -1,13 +1,13 @@
 """Which limbs an image shows, and how long ago the other limbs were last visible.
 
-A limb counts as visible up to the outermost joint that keypoints find in the image. Without
-keypoints, every part of a limb inside the image counts as visible, because silhouette, edges and
-flow can show it.
+A limb counts as visible up to its outermost joint with a keypoint in the image. Without keypoints,
+every part of a limb inside the image counts as visible, because silhouette, edges and flow can show
+it.
 
-A leg is hidden, by furniture or by the border of the image, if a detector has no confident keypoint
-of its joints beyond the hip. The detector then guesses from usual poses of legs, and a missing
-silhouette of the leg is no evidence either. If a detector is not confident of an arm, the arm is
-mostly behind the person's own trunk, where guesses are good.
+A leg is considered hidden, by furniture or the border of the image, if no keypoint of its joints
+beyond the hip is confident. The detector then guesses from usual poses of legs, and the lack of a
+silhouette of the leg is no evidence either. If the keypoints of an arm are not confident, the arm
+is mostly behind the person's own trunk, where guesses are good.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from hmt_ros.inference.error_model import seconds
 
 # Confidence below which a keypoint is a guess.
 MAX_GUESS_CONFIDENCE = 0.02
-# Confidence above which a keypoint is more likely seen than guessed.
+# Minimum confidence at which a keypoint is more likely seen than guessed.
 MIN_SEEN_CONFIDENCE = 0.5
-# Time after the last evidence for which a limb still counts as visible, or as hidden, s.
+# Time without new evidence for which a limb still counts as visible, or as hidden, s.
 MEMORY_TIME = 1.0
-# Error of an unseen joint per bone of its limb, as a fraction of the bone's length, because lengths
-# of people vary and a linear map is inexact within a posture.
+# Error of an unseen joint per bone of its limb, as a fraction of the bone's length, because
+# people's bone lengths vary and a linear map is inexact within a posture.
 ERROR_PER_BONE = 0.08
 
 
@@ -41,9 +41,10 @@ class UnseenLimbs:
     """Times since the segments of a person's limbs were last visible.
 
     Attributes:
-        times: (S,) time since each segment was visible, s; 0 if the last image shows the joint at
-            its start or one further out, or if it is not in a limb; inf if it was never visible.
-        hidden: (S,) segments that something hides from the detector; None if none is hidden.
+        times: (S,) time since each segment was visible, s. 0: the last image shows the joint at the
+            segment's start or a joint further out, or the segment is not in a limb. inf: never
+            visible.
+        hidden: (S,) segments hidden from the detector, e.g. by furniture; None if none is hidden.
     """
 
     def __init__(self, body: Body) -> None:
@@ -54,12 +55,12 @@ class UnseenLimbs:
     def without_guesses(
         self, body: Body, keypoints: Keypoints | None, stamp: int
     ) -> Keypoints | None:
-        """Keypoints with confidence 0 on hidden segments.
+        """The keypoints, with confidence set to 0 on hidden segments.
 
         Args:
             body: body of the person.
-            keypoints: keypoints of an image; None if the detector gave no result. Then hidden
-                segments stay hidden for up to `MEMORY_TIME` after its last result.
+            keypoints: keypoints of an image; None if the detector gave no result. Hidden segments
+                then stay hidden until `MEMORY_TIME` after the last result.
             stamp: stamp of the image, ns.
         """
         if keypoints is None:
@@ -78,7 +79,7 @@ class UnseenLimbs:
     def update(
         self, body: Body, camera: Camera, observation: Observation, pose: Array, dt: float
     ) -> None:
-        """Updates the times with an image and its likeliest pose (d,).
+        """Updates the times from an image and the likeliest pose (d,) in the image.
 
         Args:
             dt: time since the previous image, s; inf for the first image.
@@ -96,11 +97,11 @@ class UnseenLimbs:
         return times[body.skeleton.dof_segments]
 
     def shown_joints(self, body: Body) -> Mask:
-        """Joints (J,) that were visible within the time `MEMORY_TIME`."""
+        """Mask (J,) of the joints that were visible within the last `MEMORY_TIME`."""
         return np.asarray(self.times[body.skeleton.joint_segments] < MEMORY_TIME)
 
     def with_larger_errors(self, body: Body) -> Body:
-        """The body with larger errors of unseen joints, for unknown lengths and motion on arcs."""
+        """The body with larger errors of unseen joints: lengths vary, and joints move on arcs."""
         hidden = self.times > 0.0
         return _with_larger_errors(body, tuple(hidden.tolist())) if hidden.any() else body
 
@@ -116,7 +117,7 @@ def _with_larger_errors(body: Body, hidden: tuple[bool, ...]) -> Body:
 
 
 def hidden_segments(skeleton: Skeleton, keypoints: Keypoints) -> Mask:
-    """Segments (S,) of legs beyond the thigh that something hides from a detector."""
+    """Mask (S,) of leg segments beyond the thigh that are hidden from a detector."""
     hidden = np.zeros(len(skeleton.parents), dtype=np.bool_)
     segments = skeleton.joint_segments[skeleton.joint_index(keypoints.names)]
     sure = keypoints.seen & (keypoints.confidences >= MIN_SEEN_CONFIDENCE)
@@ -128,7 +129,7 @@ def hidden_segments(skeleton: Skeleton, keypoints: Keypoints) -> Mask:
 
 
 def shown_segments(body: Body, camera: Camera, observation: Observation, pose: Array) -> Mask:
-    """Segments (S,) that are visible in an image at a pose (d,), see `UnseenLimbs.times`."""
+    """Whether each segment (S,) is visible in an image at a pose (d,), see `UnseenLimbs.times`."""
     skeleton, keypoints = body.skeleton, observation.keypoints
     if keypoints is None:
         origins = forward(skeleton, pose[None]).segments[1][0]
@@ -144,7 +145,7 @@ def shown_segments(body: Body, camera: Camera, observation: Observation, pose: A
 
 @lru_cache(maxsize=16)
 def _showing(skeleton: Skeleton) -> Mask:
-    """Segments (S, S) that make each row's segment visible; an empty row is always visible."""
+    """Mask (S, S) of the columns that make a row's segment visible; empty: always visible."""
     result = np.zeros((len(skeleton.parents),) * 2, dtype=np.bool_)
     for chain in (chain for pair in sided_pairs(skeleton.chains) for chain in pair):
         outwards = list(skeleton.chains[chain])
@@ -158,6 +159,6 @@ def _showing(skeleton: Skeleton) -> Mask:
 
 
 def _inside(camera: Camera, pixels: Array) -> Mask:
-    """Which pixels (N, 2) lie in an image."""
+    """Whether each of the pixels (N, 2) lies in the image."""
     ends = camera.width - 0.5, camera.height - 0.5
     return np.asarray(((pixels >= -0.5) & (pixels < ends)).all(1))

@@ -1,15 +1,16 @@
-"""The vertical from the straight lines of a scene (Coughlan and Yuille, ICCV 1999).
+"""Estimates the vertical from the straight lines of a scene (Coughlan and Yuille, ICCV 1999).
 
 Edges of walls, doors and furniture run along the vertical or along two horizontal directions at
-right angles to each other. With the angle e_ik in the image between line i and the direction k of
-such a frame R, projected at the place of the line,
+right angles to each other. These three directions are a frame R. If e_ik is the angle in the image
+between line i and direction k, projected at the place of the line,
 
     log p(lines | R) = sum_i log[1 - s + s / 3 sum_k r(e_ik)],   r(e) = N(e; 0, sigma) / uniform,
 
-where a share s of all lines follows the frame and the rest is clutter. Summed over a raster of
-frames with a prior over the orientations of mounted cameras, this gives the probability that such a
-frame exists, and the direction of its vertical. Furniture has any horizontal direction, so only the
-lines that agree with the vertical refine it, with a sigma that decreases from round to round.
+where a share s of all lines follows the frame and the rest is clutter. The sum over a raster of
+frames, with a prior over the orientations of mounted cameras, gives the probability that such a
+frame exists, and the direction of its vertical. Furniture can have any horizontal direction.
+Therefore only lines that agree with the vertical refine it, with a sigma that decreases from round
+to round.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from hmt_ros.inference.logistic import probability_of
 
 # Rotation `level` of an upright camera.
 UPRIGHT_FRAME = np.eye(3)
-# Maximum side of an image, px (larger ones are reduced), and minimum length of a line, rad.
+# Maximum side of an image, px (larger images are reduced), and minimum length of a line, rad.
 MAX_IMAGE_SIDE, MIN_LINE_LENGTH = 800, 0.03
-# Angle below which two lines are one line, between their planes through the camera, rad.
+# Angle between the planes of two lines through the camera below which they are one line, rad.
 SAME_LINE_ANGLE = np.radians(0.7)
-# Share of lines that follow the frame; standard deviation of an end of a line, px.
+# Share of lines that follow the frame; standard deviation of a line's end points, px.
 FRAME_SHARE, END_SIGMA = 0.5, 0.5
 # Prior over orientations of cameras, rad: mean pitch (positive downwards), its standard deviations
 # upwards and downwards, and its limits; standard deviation of roll, and its limit.
@@ -49,8 +50,8 @@ REFINED_SIGMAS = tuple(np.radians([4.0, 3.0, 2.0, 1.0, 0.5, 0.5, 0.5]))
 RASTER_SIGMA, MIN_SIGMA = np.radians(4.0), np.radians(1.0)
 # Probability that a detected vertical is right, and density of a wrong vertical, 1/sr.
 CORRECT_PROBABILITY, UNIFORM_DENSITY = 0.9, 1.0 / (2.0 * np.pi)
-# Minimum probability that a frame exists with its vertical near the best one, and radius of this
-# neighbourhood, rad.
+# Minimum probability that a frame exists whose vertical is near the best vertical, and radius of
+# this neighbourhood, rad.
 MIN_FRAME_PROBABILITY, NEIGHBOURHOOD_RADIUS = 0.95, np.radians(10.0)
 
 
@@ -81,16 +82,16 @@ class Vertical:
     sigma: float
 
     def agreement(self, up: Array, sigma: float) -> float:
-        """Ratio of the density given another vertical `up` (3,) to a uniform density."""
+        """Density of this vertical given the vertical `up` (3,), divided by the uniform density."""
         variance = sigma**2 + self.sigma**2
         square = 2.0 - 2.0 * float(product(up, self.up))
         near = elementary.exp(-0.5 * square / variance) / (2.0 * np.pi * variance)
         return float(CORRECT_PROBABILITY * near / UNIFORM_DENSITY + 1.0 - CORRECT_PROBABILITY)
 
     def refined(self, up: Array, sigma: float) -> Vertical:
-        """Another vertical `up` (3,), refined by this one as far as both agree.
+        """Refines another vertical `up` (3,) by this vertical, in proportion to their agreement.
 
-        The other vertical moves by at most its standard deviation `sigma`.
+        The other vertical moves by at most `sigma`, its standard deviation.
         """
         right = 1.0 - (1.0 - CORRECT_PROBABILITY) / self.agreement(up, sigma)
         share = max(right, 0.0) * sigma**2 / (sigma**2 + self.sigma**2)
@@ -100,12 +101,13 @@ class Vertical:
 
 
 def seen_vertical(image: Image, camera: Camera, level: Array = UPRIGHT_FRAME) -> Vertical | None:
-    """The vertical from the lines of an image (H, W) or (H, W, 3); None if they show no vertical.
+    """The vertical from lines in an image (H, W) or (H, W, 3); None if the lines show no vertical.
 
     Args:
         image: image of the camera.
-        camera: a camera in a usual orientation, except for the rotation `level`.
-        level: (3, 3) rotation about the optical axis from an upright camera's axes to its own.
+        camera: camera in a usual orientation after the rotation `level` is undone.
+        level: (3, 3) rotation about the optical axis, from the axes of an upright camera to the
+            camera's axes.
     """
     lines = straight_lines(image, camera)
     upright = lines._replace(
@@ -122,9 +124,9 @@ def straight_lines(image: Image, camera: Camera) -> Lines:
     if scale < 1.0:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     found: Any = cv2.createLineSegmentDetector().detect(np.ascontiguousarray(grey))[0]
-    if found is None:  # no line at all
+    if found is None:  # no line found
         return Lines(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    # The middle of the first pixel is at 0 in both sizes.
+    # The centre of the first pixel is at 0 before and after the reduction.
     ends = (found.reshape(-1, 2, 2).astype(np.float64) + 0.5) / scale - 0.5
     rays = camera.rays(ends.reshape(-1, 2)).reshape(-1, 2, 3)
     rays = rays / np.linalg.norm(rays, axis=2, keepdims=True)
@@ -144,7 +146,7 @@ def straight_lines(image: Image, camera: Camera) -> Lines:
 
 
 def vertical_of(lines: Lines) -> Vertical | None:
-    """The vertical from lines; None if they are clutter or fit several verticals."""
+    """The vertical from lines; None if the lines are clutter or fit several verticals."""
     raster = _raster()
     ratios = _ratios(raster.directions, lines, COARSE_SIGMA)
     value = np.empty(raster.first.shape)
@@ -158,7 +160,7 @@ def vertical_of(lines: Lines) -> Vertical | None:
 
 
 def _refined(start: Array, lines: Lines) -> Vertical:
-    """The vertical from the lines that agree with it; `start` (3,) is from the raster."""
+    """Refines a vertical `start` (3,) from the raster by the lines that agree with it."""
     up = start
     information = np.eye(3)
     for sigma in REFINED_SIGMAS:
@@ -179,7 +181,7 @@ def _refined(start: Array, lines: Lines) -> Vertical:
 
 
 def _ratios(directions: Array, lines: Lines, sigma: float) -> Array:
-    """Ratios (D, N) to a uniform density, of N lines if they run along directions (D, 3)."""
+    """Ratios r (D, N) of the module's equation, for N lines and directions (D, 3)."""
     deviations = np.sqrt(sigma**2 + lines.errors**2)
     result = np.empty((len(directions), len(deviations)))
     rate_lines(directions, lines.normals, lines.middles, deviations, result)
@@ -187,7 +189,7 @@ def _ratios(directions: Array, lines: Lines, sigma: float) -> Array:
 
 
 def _distinct(normals: Array) -> Index:
-    """Indices of unit normals (N, 3) that differ from all normals kept before."""
+    """Indices of unit normals (N, 3), of which none is close to an earlier normal."""
     same = np.abs(product(normals, normals.T)) > elementary.cos(SAME_LINE_ANGLE)
     free = np.ones(len(normals), dtype=np.bool_)
     kept = []
@@ -199,12 +201,13 @@ def _distinct(normals: Array) -> Index:
 
 
 class _Raster(NamedTuple):
-    """Frames that a camera may see: F verticals, each with A pairs of horizontal directions.
+    """Candidate frames: F verticals, each with A pairs of horizontal directions.
 
     Attributes:
         ups: (F, 3) verticals.
         log_prior: (F,) log prior probabilities of the verticals.
-        directions: (D, 3) all distinct directions of the frames, rounded, without sign.
+        directions: (D, 3) all distinct directions of the frames, rounded; opposite directions are
+            equal.
         vertical: (F,) index of each vertical in `directions`.
         first, second: (F, A) indices of the horizontal directions in `directions`.
     """

@@ -9,7 +9,7 @@ observations add to the diagonal blocks, and the dynamics couple neighbours,
 
 Forward elimination is filtering, backward substitution is smoothing. The cost is O(T n^3), without
 a dense (T n, T n) array: the matrix is in LAPACK's band storage, whose width depends on the
-coupling blocks E_t; with diagonal E_t it is half of the width with full blocks.
+coupling blocks E_t. With diagonal E_t, the band is half as wide as with full blocks.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class NotPositiveDefiniteError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class BlockTridiagonal:
-    """A symmetric matrix of T x T blocks of n x n.
+    """A symmetric matrix of T x T blocks, each of size n x n.
 
     Attributes:
         diagonal: (T, n, n) diagonal blocks D_t; only the lower triangles are read.
@@ -99,9 +99,9 @@ class BlockCholesky:
 
     Attributes:
         columns: (T n, width + 1) of L in LAPACK's band storage: [j, i - j] = L[i, j].
-        times, size: number of blocks T, and size of a block n.
-        last_first: whether blocks are eliminated from the last to the first; blocks of the inverse
-            are then computed from the first on.
+        times, size: number T of blocks, and size n of each block.
+        last_first: whether blocks are eliminated from the last to the first. If so, blocks of the
+            inverse are computed from the first to the last.
     """
 
     columns: Array
@@ -145,7 +145,7 @@ class BlockCholesky:
         return own, below
 
     def inverse_blocks(self, count: int | None = None) -> Array:
-        """Diagonal blocks (count, n, n) of P^-1 from the first on; None: all T blocks.
+        """Returns the first `count` diagonal blocks (count, n, n) of P^-1; None: all T blocks.
 
         If P is a precision, these are the marginal covariances. The recursion runs backwards along
         L, with G_t = L_{t+1,t} L_t^-1:
@@ -177,7 +177,7 @@ class BlockCholesky:
         return BlockTridiagonal(diagonal, lower)
 
     def _windows(self, offset: int, count: int) -> Array:
-        """Blocks L[t n + offset + a, t n + b] for t < count; entries outside the band are garbage.
+        """Blocks L[t n + offset + a, t n + b] for t < count; values outside the band are undefined.
 
         L[i, j] has the flat index i + j * width.
         """
@@ -202,7 +202,7 @@ class BlockCholesky:
 
 
 def bandwidth(lower: Array, n: int) -> int:
-    """Number of diagonals below the main one, given the coupling blocks E_t (T-1, n, n)."""
+    """Number of diagonals below the main diagonal, given the blocks E_t (T-1, n, n)."""
     row, column = np.nonzero((lower != 0).any(axis=0))
     return max(n - 1, n + int((row - column).max(initial=-n)))
 

@@ -6,9 +6,9 @@ quadratic model in the box,
     g.s + 1/2 s.(H + lambda W) s    subject to    lower - x <= s <= upper - x,
 
 with an active set: variables that the step drives across a limit are fixed at the limit, the step
-of the others is solved again, and fixed variables that the energy pulls inwards are released.
-`TrustRegion` adapts lambda. Each problem has its own lambda and active set, and leaves the batch
-when it has converged.
+is solved again for all other variables, and fixed variables that the energy pulls inwards are
+released. `TrustRegion` adapts lambda. Each problem has its own lambda and active set, and leaves
+the batch when it has converged.
 
 The ratio of actual to predicted decrease sets the damping lambda of the next step [Nielsen, Damping
 parameter in Marquardt's method, 1999]:
@@ -77,7 +77,7 @@ def minimise(
     """Minimises N problems from their starts x (N, d).
 
     Args:
-        term: energy term; it is called with the rows of the problems that have not converged yet.
+        term: energy term; it is evaluated with the rows of problems that have not converged yet.
             `EnergyFunction` wraps a function of points and rows.
         x: starts (N, d), which are projected onto the box.
         lower, upper: limits, (d,), (N, d) or scalar.
@@ -139,7 +139,7 @@ def resting(x: Array, gradient: Array, lower: Array, upper: Array) -> NDArray[np
 
 
 class Status(IntEnum):
-    """Why a minimisation stopped."""
+    """Reason why a minimisation stopped."""
 
     CONVERGED = 0  # the predicted decrease, or the gradient on the free variables, is small enough
     ITERATION_LIMIT = 1
@@ -175,11 +175,11 @@ class TrustRegion:
         self._limit, self._least_factor, self._least_refused = limit, least_factor, least_refused
 
     def accept(self, rows: Index, decrease: Array, predicted: Array) -> NDArray[np.bool_]:
-        """Return the mask (n,) of accepted steps, and update the damping of their problems.
+        """Return the mask (n,) of accepted steps, and adapt the damping of their problems.
 
         Args:
             rows: (n,) indices of the problems.
-            decrease: (n,) decrease of the energies; values that are not finite count as no
+            decrease: (n,) decrease of the energies; values that are not finite are treated as no
                 decrease.
             predicted: (n,) predicted decrease, positive.
         """

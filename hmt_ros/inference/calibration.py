@@ -1,12 +1,12 @@
-"""Calibration of densities: levels of true values in highest-density regions.
+"""Calibration of densities, from the highest-density regions that contain the true values.
 
 The level of a value x under a density p is the probability content of the smallest highest-density
 region that contains x,
 
     level(x) = P(p(X) > p(x)),  X ~ p,
 
-so that the highest-density region of probability q contains x exactly if level(x) <= q. Values
-drawn from their own densities have levels that are uniform on [0, 1], for any densities. The share
+so that the highest-density region of probability q contains x if and only if level(x) <= q. If each
+value is drawn from its density, the levels are uniform on [0, 1], whatever the densities. The share
 of levels up to q is the coverage of the region of probability q, and should equal q. Best-of-N
 errors alone reward miscalibrated densities, see Pierzchlewicz et al., "Multi-hypothesis 3D human
 pose estimation metrics favor miscalibrated distributions" (2022).
@@ -25,11 +25,11 @@ from hmt_ros.inference.random_numbers import standard_normals
 
 
 def levels_of(at_points: Array, at_samples: Array) -> Array:
-    """Levels of points: shares of samples with a higher density than each point.
+    """Level of each point: the share of samples with a higher density than the point.
 
     Args:
         at_points: (N, ...) densities at the points, or any increasing function of the densities.
-        at_samples: (S, ...) the same function at samples from the density; further axes hold
+        at_samples: (S, ...) the same function at samples from the density; further axes are for
             further densities.
     """
     return np.asarray((at_samples[:, None] > at_points[None]).mean(0))

@@ -29,11 +29,11 @@ def k_means(
 
 
 def spread_points(points: Array, count: int, rng: np.random.Generator) -> Index:
-    """Indices of at most `count` of the points (N, p), spread over the data.
+    """Indices of at most `count` points, spread over the data (N, p).
 
     The seeds of k-means++ [Arthur and Vassilvitskii, SODA 2007]: each point is drawn with a
-    probability proportional to its squared distance to the nearest selected point. The first few
-    points are spread over the data as well. Equal points are selected once.
+    probability proportional to its squared distance to the nearest selected point. Any first few of
+    the selected points are spread over the data as well. Equal points are selected once.
     """
     chosen = [int(rng.integers(len(points)))]
     distance = np.full(len(points), np.inf)
@@ -49,7 +49,7 @@ def spread_points(points: Array, count: int, rng: np.random.Generator) -> Index:
 
 
 def smallest_columns(values: Array, count: int) -> Index:
-    """Ascending columns (N, count) of the smallest values in each row of (N, M).
+    """Column indices (N, count), ascending, of the smallest values in each row of (N, M).
 
     Ties are broken by position, because numpy's own selection depends on the processor.
     """

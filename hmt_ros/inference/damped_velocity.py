@@ -95,7 +95,7 @@ class DampedVelocity(LinearGaussianDynamics):
         return moved, noise
 
     def _decay(self, interval: float) -> tuple[Array, Array]:
-        """a and b (d,): shift of the pose per velocity, and remaining share of the velocity."""
+        """a and b (d,): shift of the pose per unit velocity, and remaining fraction of velocity."""
         lost: Array = -elementary.expm1(-self.damping * interval)
         return lost / self.damping, 1.0 - lost
 

@@ -1,4 +1,4 @@
-"""Energies: minus the logarithms of the factors of a posterior; energies add.
+"""Energies: minus the logarithms of the factors of a posterior.
 
     E(x) = - sum_i log p_i(x),     g = dE/dx,     H ~ d2E/dx2
 
@@ -25,12 +25,12 @@ class Derivatives(IntEnum):
 
     NONE = 0
     GRADIENT = 1  # the gradient; a term may return a Hessian with it
-    POSITIVE = 2  # gradient and a positive semi-definite Hessian: Gauss-Newton, or a majorising one
-    EXACT = 3  # gradient and the exact Hessian if the term has it; else as POSITIVE
+    POSITIVE = 2  # gradient and a positive semi-definite Hessian (Gauss-Newton or majorising)
+    EXACT = 3  # gradient and the exact Hessian; as POSITIVE if the term has no exact Hessian
 
 
 class Energy(NamedTuple):
-    """Energies of N points; they add.
+    """Energies of N points; supports addition.
 
     Attributes:
         value: (N,) energies, nats.

@@ -6,12 +6,12 @@
 
 An error with the correlation time tau is an AR(1) process: errors of measurements dt apart have the
 correlation rho. A long series of n measurements of a constant has the information of a(dt) n
-independent ones, so each measurement counts with the share a(dt) [Bartlett 1946]. For small dt the
+independent measurements, so each measurement has the weight a(dt) [Bartlett 1946]. For small dt the
 share is dt / (2 tau): the information per second does not depend on the rate. For large dt the
 share is 1.
 
 Persistent errors cancel in differences: the change of a pose between two measurements has only the
-error that is new, with 1 - rho^2 of the variance.
+new part of the error, with the fraction 1 - rho^2 of the variance.
 """
 
 from __future__ import annotations
@@ -63,20 +63,20 @@ class CueErrors:
         return self.independent * share_of_time(dt, self.time)
 
     def together(self, count: float) -> float:
-        """Factor on the summed information of many images of one constant.
+        """Factor on the information about a constant, summed over many images.
 
-        The mean over n images has the variance 1 / n + c, that is n / (1 + c n) times the
-        information of one.
+        The mean over n images has the variance 1 / n + c relative to one image, so its information
+        is n / (1 + c n) times that of one image.
 
         Args:
-            count: number n of images, that is the sum of their shares.
+            count: effective number n of images, which is the sum of their shares.
         """
         return 1.0 / (1.0 + self.constant * count)
 
     def of_changes(self, dt: float) -> float:
-        """Weight of the curvature of an image as a measurement of the change of a pose in dt s.
+        """Weight of an image's curvature as evidence on the change of a pose in dt seconds.
 
-        Only the new part of the error counts, so the weight is s / (1 - rho^2).
+        Only the new part of the error contributes, so the weight is s / (1 - rho^2).
         """
         new = -float(elementary.expm1(-2.0 * dt / self.time)) if self.time > 0.0 else 1.0
         return self.independent / new
@@ -92,12 +92,12 @@ def errors_of_cues(amounts: Mapping[str, float]) -> CueErrors:
         s = sum_g c_g s_g / C,    s / tau = sum_g c_g s_g / tau_g / C,    C = sum_g c_g
 
     c_g is the contribution of cue g to the likelihood: the number of variables that its curvature
-    determines. At low rates the likelihood then counts with the mean share of its cues. At high
-    rates, the images of a second have the same information as with separate cues. In between the
+    determines. At low rates the likelihood then has the mean share of its cues. At high rates, the
+    images of a second have the same information as with separate cues. At rates in between, the
     share is an approximation; with equal tau_g it is exact.
 
     Args:
-        amounts: contributions c_g by name of the cue in `ERRORS`, none negative, not all 0.
+        amounts: contributions c_g by cue name in `ERRORS`; not negative, and not all 0.
 
     Raises:
         ValueError: an amount is negative or not finite, or all are 0.
@@ -113,15 +113,16 @@ def errors_of_cues(amounts: Mapping[str, float]) -> CueErrors:
     return CueErrors(share, share / rate)
 
 
-# Ratio of the covariance of a pose given all images so far to that given the last image alone, with
+# Ratio of two covariances of a pose: given all images so far, and given the last image alone with
 # its share of the evidence; see `benchmarks/joint_errors.py`.
 JOINT_COVARIANCE_RATIO = 0.29
 
 # Chosen, not learned, at 30 and 3 images per second (docs/tracking.md). The prior of the pose is
 # discounted like a cue, because it evaluates the same pose again in every image. `lifted` are the
-# depths from experts, which also have a weight of their own. `shape` is the evidence from images on
-# lengths and flesh: different poses are independent evidence on these, but not on clothes. Its
-# constant share was chosen among 0.03, 0.12 and 0.3 on clips played back and forth for 45 s.
+# depths from experts, which also have a separate weight. `shape` is the evidence from images on
+# lengths and flesh: different poses are independent evidence on lengths and flesh, but not on
+# clothes. The constant share was chosen among 0.03, 0.12 and 0.3 on clips played back and forth for
+# 45 s.
 _IMAGE_ERRORS, _KEYPOINT_ERRORS = CueErrors(0.15, 0.019), CueErrors(0.35, 0.053)
 ERRORS: Mapping[str, CueErrors] = MappingProxyType(
     {
@@ -133,7 +134,7 @@ ERRORS: Mapping[str, CueErrors] = MappingProxyType(
     }
 )
 # Factor on the depths from experts if they are discounted like keypoints: the ratio of the
-# information per second of both at a high rate.
+# information per second of experts and keypoints at a high rate.
 LIFTED_INFORMATION_RATIO = (
     ERRORS['lifted'].independent
     / ERRORS['lifted'].time

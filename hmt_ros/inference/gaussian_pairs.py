@@ -48,7 +48,7 @@ def pair_mixture_log_determinants(
 
 
 def _of_pairs(pairs: Index, scales: Array, *sets: Array) -> tuple[Array, Array]:
-    """D and log |C|, both (P,), for pairs from two sets of means and covariances.
+    """D (P,) and log |C| (P,) for pairs from two sets of means and covariances.
 
     Args:
         pairs: (P, 2) indices in the first set and in the second.

@@ -3,8 +3,8 @@
     d = -H g,   H from the last pairs of steps and changes of the gradient      [Nocedal, 1980]
     f(x + a d) <= f(x) + 1e-3 a g.d,   |g(x + a d).d| <= 0.9 |g.d|        [More, Thuente, 1994]
 
-The iterates equal those of L-BFGS-B without bounds. The library L-BFGS-B is not used, because it
-calls BLAS, whose sums depend on the processor.
+The iterates equal the iterates of L-BFGS-B without bounds. The library L-BFGS-B is not used,
+because it calls BLAS, whose sums depend on the processor.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ Function = Callable[[Array], tuple[float, Array]]
 def descent(
     function: Function, start: Array, *, memory: int, most_evaluations: int
 ) -> Iterator[tuple[Array, float]]:
-    """Yield each iterate and its value, until the value decreases no further.
+    """Yield each iterate and its value, until the value stops decreasing.
 
     Args:
         function: function that returns value and gradient (n,) at a point (n,).
         start: (n,) first point.
-        memory: maximum number of stored pairs.
+        memory: maximum number of stored pairs of steps and gradient changes.
         most_evaluations: number of evaluations after which the descent ends.
     """
     x = start
@@ -104,7 +104,7 @@ class LineSearch:
     """A line search: the caller evaluates `step` and passes value and slope to `advance`.
 
     Attributes:
-        step: next step to evaluate, or the step found.
+        step: next step to evaluate, or the step that was found.
         found: whether the step satisfies the conditions.
         ended: whether the search is over.
         count: number of evaluations.
@@ -159,7 +159,7 @@ class LineSearch:
 def _next(
     best: _At, other: _At, here: _At, bracketed: bool, low: float, high: float
 ) -> tuple[_At, _At, float, bool]:
-    """Ends of the new interval, next step, and whether the interval brackets a minimum."""
+    """Both ends of the new interval, the next step, and whether the interval brackets a minimum."""
     opposite = here.slope * math.copysign(1.0, best.slope) < 0.0
     far = here.step - best.step
     secant = (

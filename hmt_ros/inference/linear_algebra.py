@@ -1,9 +1,9 @@
 """Linear algebra with bit-identical results on every processor.
 
 BLAS and LAPACK, which numpy calls, choose kernels by processor, and these add in different orders.
-The functions of this module add in a fixed order. They broadcast over leading axes, and raise
-`numpy.linalg.LinAlgError` if there is no result, as numpy does. They are meant for matrices of up
-to some hundreds of rows.
+The functions of this module add in a fixed order. They broadcast over leading axes and, as in
+numpy, raise `numpy.linalg.LinAlgError` if there is no result. They are meant for matrices with up
+to a few hundred rows.
 """
 
 from collections.abc import Callable
@@ -133,7 +133,7 @@ def singular_values(matrix: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 def pseudo_inverse(matrix: ArrayLike, tolerance: float = 1e-15) -> Array:
-    """Moore-Penrose inverse (..., n, m); singular values s up to `tolerance` max s count as 0."""
+    """Moore-Penrose inverse (..., n, m); treats singular values s <= `tolerance` max s as 0."""
     u, values, vt = singular_values(matrix)
     large = values > tolerance * values[..., :1]
     inverses = np.divide(1.0, values, out=np.zeros_like(values), where=large)

@@ -36,7 +36,7 @@ MAX_INTERVALS = 64
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryPrior:
-    """-log p(X) = 1/2 X'PX - h'X + c over states X (T, n).
+    """Prior p(X) over states X (T, n), -log p(X) = 1/2 X'PX - h'X + c.
 
     Attributes:
         precision: block-tridiagonal matrix P.
@@ -73,12 +73,12 @@ class TrajectoryPrior:
 
 
 class Couplings(NamedTuple):
-    """Terms that couple T successive states, for each different interval between two.
+    """Terms that couple T successive states, stored once for each distinct interval.
 
     Attributes:
-        before, after, forth: (I, n, n) matrices A' Q^-1 A, Q^-1 and Q^-1 A of I different
+        before, after, forth: (I, n, n) matrices A' Q^-1 A, Q^-1 and Q^-1 A for I distinct
             intervals.
-        which: (T-1,) index of the interval after each state but the last.
+        which: (T-1,) index of the interval after each state except the last.
         log_determinants: (T-1,) log |Q| of the interval after each state.
     """
 
@@ -105,7 +105,7 @@ class LinearGaussianDynamics:
     Attributes:
         drift: (n, n) drift F, per second.
         diffusion: (n, n) diffusion Qc, covariance gained per second.
-        dimension: number d of observed variables; the others are velocities.
+        dimension: number d of observed variables; all other variables are velocities.
         initial_mean: (n,) mean of the first state.
         initial_precision: (n, n) precision of the first state; zero for unknown variables.
         step: interval between observations without timestamps, s.
@@ -206,7 +206,7 @@ class LinearGaussianDynamics:
 
     @cached_property
     def coupling(self) -> Callable[[float], tuple[Array, Array, Array, float]]:
-        """Function that returns A' Q^-1 A, Q^-1 and Q^-1 A, (n, n), and log |Q|; cached."""
+        """Cached function that returns A' Q^-1 A, Q^-1 and Q^-1 A, (n, n), and log |Q|."""
         return lru_cache(MAX_INTERVALS)(self._coupling)
 
     def _coupling(self, interval: float) -> tuple[Array, Array, Array, float]:
@@ -292,7 +292,7 @@ class LinearGaussianDynamics:
         Args:
             intervals: (T-1,) intervals, s.
             initial: whether to include the prior of the first state.
-            noise: factor on the noise over each interval, (T-1,) or scalar.
+            noise: factor on the noise covariance over each interval, (T-1,) or scalar.
 
         Raises:
             ValueError: the noise over an interval is not positive definite.

@@ -4,7 +4,7 @@
     update    log p_i <- log p_i + l_i - const      l_i: log likelihood of an observation in state i
 
 Two states have the closed form  p_1 <- u + (p_1 - u) exp(-(q_01 + q_10) dt),  u = q_01 / (q_01 +
-q_10). Results do not depend on the division of time into steps, nor on the frame rate.
+q_10). Results depend neither on the division of time into steps nor on the frame rate.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class MarkovChain:
 
     @classmethod
     def of_two(cls, begins: float, ends: float) -> MarkovChain:
-        """Chain with two states, given the rates at which the second begins and ends, 1/s.
+        """Chain with two states, given the rates at which the second state begins and ends, 1/s.
 
         Example:
             >>> chain = MarkovChain.of_two(begins=1.0, ends=3.0)
@@ -64,7 +64,7 @@ class MarkovChain:
         return float(self.rates[0, 1] + self.rates[1, 0])
 
     def transition(self, dt: float) -> Array:
-        """Probabilities (n, n) of state j, dt seconds after state i."""
+        """Matrix (n, n) of the probabilities of state j, dt seconds after state i."""
         if len(self.rates) == 2:
             share = -elementary.expm1(-self._rate * dt)
             return np.asarray((1.0 - share) * np.eye(2) + share * self.usual)
@@ -75,7 +75,7 @@ class MarkovChain:
         return np.asarray(product(p, self.transition(dt)))
 
     def closed(self, p: ArrayLike, dt: float) -> Array:
-        """Predicts probabilities (...) of the second of two states, by the closed form."""
+        """Predicts probabilities (...) of the second of two states, in closed form."""
         return np.asarray(p + (p - self.usual[1]) * elementary.expm1(-self._rate * dt))
 
 
@@ -92,6 +92,6 @@ def update(p: ArrayLike, log_likelihoods: ArrayLike) -> Array:
 
 
 def of_log_odds(log_odds: ArrayLike) -> Array:
-    """Probabilities (..., 2) of two states, from the log odds of the second, nats."""
+    """Probabilities (..., 2) of two states, from the log odds of the second state, nats."""
     is_so = probability_of(log_odds)
     return np.stack([1.0 - is_so, is_so], axis=-1)

@@ -25,7 +25,7 @@ from hmt_ros.inference.random_numbers import standard_normals
 class GaussianMixture:
     """A mixture of K Gaussians over R^d.
 
-    Weights need not sum to 1, because the modes of a likelihood form an unnormalised mixture; see
+    Weights need not sum to 1, because the modes of a likelihood are an unnormalised mixture; see
     `normalised`.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""Markov chain of a filter's modes: weights and paths given later images.
+"""Markov chain of a filter's modes: weights and paths given all images.
 
     W_T(k) = w_k                                                        the newest image T  (1)
     W_t(j) = sum_k W_(t+1)(k) P(j | k)                                  t < T               (2)
@@ -6,8 +6,8 @@
 
 This is the backward pass of forward filtering, backward smoothing [Doucet, Godsill and Andrieu,
 2000]. P(j | k) is the probability that mode k continues mode j of the previous image. The evidence
-of an image for a mode is a factor of w_k only: it cancels in P(j | k), and reaches image t by (1)
-and (2). So (2) and (3) are exact for the filter's own chain, and add no parameters.
+of an image for a mode is a factor of w_k only: it cancels in P(j | k), and is passed to image t by
+(1) and (2). So (2) and (3) are exact for the filter's own chain, and add no parameters.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Link(NamedTuple):
     """Modes of an image in the chain.
 
     Attributes:
-        weights: (K,) posterior probabilities given this image and earlier ones.
+        weights: (K,) posterior probabilities given this image and earlier images.
         origins: (K, M) probability that mode k continues mode m of the previous image; rows sum to
             1. M is 0 at the start of the chain.
     """
@@ -46,9 +46,9 @@ def drawn_paths(links: Sequence[Link], count: int, seed: int) -> tuple[Index, Ar
     """Draw paths from (3); paths with the same first mode share its smoothed weight.
 
     Paths are drawn forwards, with P(k | j) = W_(t+1)(k) P(j | k) / W_t(j). Each mode of the oldest
-    image with a positive weight (2) starts at least one path, and its paths have this weight
-    exactly. Paths through one mode are distributed over its successors by systematic sampling in a
-    random order.
+    image with a positive weight (2) starts at least one path, and the weights of its paths sum
+    exactly to this weight. Paths through one mode are distributed over its successors by systematic
+    sampling in a random order.
 
     Args:
         count: approximate number of paths.
@@ -78,13 +78,12 @@ def drawn_paths(links: Sequence[Link], count: int, seed: int) -> tuple[Index, Ar
 
 
 def reachable_origins(away: Array, weights: Array, reach: float) -> Array:
-    """Return origins (K, M) of modes of unknown ancestry: previous modes within reach.
+    """Return origins (K, M) of modes with unknown ancestors: previous modes within reach.
 
     Args:
         away: (K, M) distances from the modes of the previous image, m.
         weights: (M,) weights of the modes of the previous image.
-        reach: maximum distance of motion between the images, m; without a mode within reach, all
-            modes are used.
+        reach: maximum motion between the images, m; if no mode is within reach, all modes are used.
     """
     near = (away <= reach) * weights
     lost = ~near.any(1)

@@ -6,8 +6,8 @@ the covariance P*, the prediction N((x, v), P) is conditioned on x*,
     G = P_vx P_xx^-1,    v* = v + G (x* - x),    P*_vv = P_vv - G P_xv + G P* G',    P*_vx = G P*
 
 which is the Kalman filter if the energy of the image is quadratic. If a limb has jumped, its
-displacement is no motion, so its velocity is unknown. Its position is as uncertain as after a
-random walk at the rates of the body; this is also the search range of jumps.
+displacement is not a motion, so its velocity is unknown. Its position is as uncertain as after a
+random walk at the rates of the body, which is also the search range of jumps.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class PredictedStates:
 
     @property
     def searched(self) -> Array:
-        """Covariances (K, d, d) of poses for the search of jumps."""
+        """Covariances (K, d, d) of poses in which to search for jumps."""
         return self.pose_covariances + np.diag(self.wandered)
 
     def covariances_of(self, ancestors: Index, jumped: Mask) -> Array:
@@ -78,7 +78,7 @@ class PredictedStates:
 
         Args:
             ancestors: (N,) mode from which each state was predicted.
-            jumped: (N, d) whether a degree of freedom jumped instead of moving.
+            jumped: (N, d) whether each degree of freedom jumped instead of moving.
             poses: (N, d) fitted poses.
             found: (N, d, d) covariances of the fitted poses.
         """

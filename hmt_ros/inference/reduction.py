@@ -1,11 +1,11 @@
 """Reduction of mixtures to fewer components with approximately the same density.
 
-Components are merged into one Gaussian with their weight, mean and covariance,
+Components are merged into one Gaussian that has their total weight, mean and covariance,
 
     w = sum_i w_i,   m = sum_i w_i m_i / w,   S = sum_i w_i (S_i + (m_i - m) (m_i - m)') / w,
 
-so that the mean and the covariance of the whole mixture are preserved. The functions differ in the
-choice of the components to merge:
+so that the mean and the covariance of the whole mixture are preserved. The functions select the
+components to merge in different ways:
 
 - `merged_pairwise`: the pair of least cost, an upper bound on the Kullback-Leibler divergence due
   to its merge [Runnalls, IEEE TAES 2007], until few components are left,
@@ -14,7 +14,7 @@ choice of the components to merge:
 
 - `merged_if_close`: the closest pair, until no pair is closer than a given distance;
 - `reduced`: clusters of means, refined to lower a bound on the divergence between the large mixture
-  and the small one [Goldberger and Roweis, NIPS 2004].
+  and the small mixture [Goldberger and Roweis, NIPS 2004].
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ NEGLIGIBLE_WEIGHT = 1e-8
 
 
 def merged(mixture: GaussianMixture, share: Array) -> GaussianMixture:
-    """Merge components into new ones with the same moments.
+    """Merge components into new components with the same moments.
 
     Args:
-        share: (K, B) share of each component that each of B new components gets; empty ones are
-            left out.
+        share: (K, B) share of each component that each of B new components gets; empty new
+            components are left out.
     """
     mass = share * mixture.weights[:, None]
     total = mass.sum(0)
@@ -66,7 +66,7 @@ def merged_pairwise(mixture: GaussianMixture, count: int) -> GaussianMixture:
         ValueError: count < 1.
 
     Example:
-        The merged component keeps the mean and the covariance of both.
+        The merged component has the mean and the covariance of the mixture.
 
         >>> two = GaussianMixture([0.5, 0.5], [[-1.0], [1.0]], [[[0.25]], [[0.25]]])
         >>> merged_pairwise(two, 1).covariances
@@ -81,7 +81,7 @@ def merged_if_close(mixture: GaussianMixture, distance: float) -> GaussianMixtur
     """Merge the closest components until no pair is closer than a distance.
 
     Args:
-        distance: distance of means, in standard deviations of the average of both covariances.
+        distance: distance of means, in standard deviations of the average covariance of the pair.
     """
     return _merged_pairs(mixture, _squared_distances, lambda _, cost: cost < distance**2)
 
@@ -138,7 +138,7 @@ def _squared_distances(w: Array, m: Array, s: Array, log_det: Array, pairs: Inde
 def reduced(mixture: GaussianMixture, count: int, iterations: int = 10) -> GaussianMixture:
     """Reduce to at most `count` components: cluster means, then lower the bound of `assignment`.
 
-    If pairwise merging has a lower bound than the clusters, the descent starts from its result.
+    The descent starts from the clusters or from pairwise merging, whichever has the lower bound.
 
     Raises:
         ValueError: count < 1.
@@ -189,7 +189,7 @@ def clustered(mixture: GaussianMixture, count: int, iterations: int = 20) -> Gau
 
 
 def assignment(large: GaussianMixture, small: GaussianMixture) -> tuple[float, Array]:
-    """Bound on the divergence, nats, and assignment of large components to small ones.
+    """Bound on the divergence, nats, and assignment of large mixture to small mixture components.
 
     sum_a w_a min_b KL(large_a || small_b) >= KL(large || small) if the weight of each small
     component is the sum of the weights assigned to it, as after `merged` [Goldberger & Roweis, NIPS

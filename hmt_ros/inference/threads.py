@@ -1,6 +1,6 @@
 """Distribution of work among threads, for calls that release the interpreter lock.
 
-Each piece is computed independently and stored at its own place, so results do not depend on the
+Each item is computed independently and stored at a separate place, so results do not depend on the
 number of threads.
 """
 
@@ -30,7 +30,7 @@ def in_threads(
     """Distributes items among threads.
 
     Args:
-        work: function that processes the items from a first index up to an end index.
+        work: function that processes the items from a first index to an end index (exclusive).
         least: minimum number of items per thread.
         threads: maximum number of threads; 0: one per core, up to `MAX_THREADS`, with one core
             left for other processes such as a camera or a smoother.
@@ -47,7 +47,7 @@ def in_threads(
 
 
 def together(calls: Sequence[Callable[[], Any]], threads: int = 0) -> list[Any]:
-    """Return the results of calls that are distributed among threads as in `in_threads`.
+    """Call functions in threads, distributed as by `in_threads`; return their results.
 
     Args:
         calls: functions that call neither `together` nor `in_threads`.

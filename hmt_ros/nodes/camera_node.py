@@ -48,14 +48,14 @@ from msg_tools.messages.images import image_message
 
 NAME = 'camera_node'
 FRAME_ID = 'camera_optical_frame'
-# Assumed image rate of a file that does not give it, 1/s.
+# Image rate assumed for files that do not specify a rate, 1/s.
 _USUAL_RATE = 30.0
-# Time without an image after which a device counts as unplugged, and interval between attempts to
-# open it again, s.
+# Time without an image after which a webcam is considered unplugged, and interval between attempts
+# to open it again, s.
 _UNPLUGGED_TIME, _REOPENING_INTERVAL = 5.0, 1.0
 _POLLING_PERIOD, _CONNECTION_TIME = 0.05, 0.5
-# Time limit for an active node to be discovered as subscriber, s: participants announce themselves
-# every 3 s.
+# Time limit for discovering the subscription of an active node, s: middleware participants
+# announce themselves every 3 s.
 _DISCOVERY_TIME = 5.0
 # Interval between reports on nodes that are not active yet, s.
 _REPORT_INTERVAL = 10.0
@@ -83,13 +83,13 @@ class Video:
 
     Args:
         source: '/dev/video0', the number of a device, or the path of a file.
-        loop, speed: values of `loop` and `rate` for a file, see `CameraNodeParameters`.
+        loop, speed: values of the parameters `loop` and `rate`; ignored for a webcam.
 
     Attributes:
         is_file: whether the source is a file.
 
     Raises:
-        ValueError: the source can not be opened or used; one line.
+        ValueError: the source can not be opened or used (one-line message).
     """
 
     def __init__(self, source: str, *, loop: bool = False, speed: float = 1.0) -> None:
@@ -105,7 +105,7 @@ class Video:
                 f'{source} can not be opened; wanted a webcam that no other program uses'
             )
         if self.is_file and is_mirrored(display_matrix(Path(source)) or IDENTITY):
-            # OpenCV would turn mirrored images by 180 degrees.
+            # OpenCV would rotate mirrored images by 180 degrees.
             raise ValueError(
                 f'{source}: its metadata mirror the images; convert it with ffmpeg -i {source} '
                 'shown.mp4'
@@ -116,11 +116,11 @@ class Video:
     def images(
         self, stopped: threading.Event, warn: Callable[[str], Any]
     ) -> Iterator[tuple[Image, int | None]]:
-        """Images (H, W, 3) BGR, each with its time since the first image of a file, ns, or None.
+        """Images (H, W, 3) BGR with their times since the first image of a file, ns, or None.
 
         Args:
             stopped: event that ends the iteration.
-            warn: function that receives a line when a device is unplugged, and when it is back.
+            warn: function that receives a message when the webcam is unplugged or back.
         """
         start, number, seen, again, gone = time.monotonic(), 0, time.monotonic(), 0, False
         while not stopped.is_set():
@@ -212,7 +212,7 @@ def _angle(text: str) -> float:
 
 
 def _await_active(node: Any, names: list[str], stopped: threading.Event) -> None:
-    """Waits until the lifecycle nodes of these names are active, or until stopped."""
+    """Waits until the named lifecycle nodes are active, or until `stopped` is set."""
     from lifecycle_msgs.msg import State
     from lifecycle_msgs.srv import GetState
 
@@ -233,7 +233,7 @@ def _await_active(node: Any, names: list[str], stopped: threading.Event) -> None
 
 
 def _await_subscriber(node: Any, images: Any, stopped: threading.Event, patience: float) -> None:
-    """Waits for a subscriber to the images, for at most `patience` s, or until stopped."""
+    """Waits up to `patience` s for a subscriber to the images, or until `stopped` is set."""
     end = time.monotonic() + patience
     while not images.get_subscription_count() and not stopped.is_set() and time.monotonic() < end:
         rclpy.spin_once(node, timeout_sec=_POLLING_PERIOD)
@@ -280,7 +280,7 @@ def _show(
 
 
 def _camera(node: Any, given: argparse.Namespace, size: tuple[int, int]) -> Camera:
-    """The camera by calibration or field of view; warns if the field of view is assumed."""
+    """The camera from a calibration or field of view; warns if the field of view is assumed."""
     if given.calibration is not None:
         return read_camera(given.calibration, size, node.get_logger().warn)
     if given.fov is None:

@@ -24,16 +24,16 @@ _LOST_MESSAGES_KEY = 'messages lost'
 
 
 class Rates:
-    """Rates in the last period of the diagnostics.
+    """Message rates during the last diagnostics period.
 
     Args:
         name: plural name of the counted messages, such as 'images'.
-        done: name of the count of used messages, such as 'tracked'.
+        done: key of the count of used messages, such as 'tracked'.
 
     Attributes:
         name: plural name of the counted messages.
-        change: changes of the counts in the last period.
-        computing: text on the computing time of a message.
+        change: increase of each count in the last period.
+        computing: statement about the computing time per message, for the diagnostics.
     """
 
     def __init__(self, name: str, done: str) -> None:
@@ -45,11 +45,11 @@ class Rates:
         self._waiting, self._seconds, self._began = 0, 1.0, time.monotonic()
 
     def next_period(self, counts: Counter[str], durations: list[Duration], waiting: int) -> None:
-        """Ends a period.
+        """Ends a diagnostics period and begins the next.
 
         Args:
-            counts: numbers of 'received', 'dropped', 'lost' and used messages, and of 'faults',
-                since the start.
+            counts: totals since the start: 'received', 'dropped', 'lost', 'faults', and the used
+                messages under the key `done`.
         """
         now = time.monotonic()
         self._seconds, self._began = max(now - self._began, 1e-3), now
@@ -88,13 +88,13 @@ class Rates:
         return self.change[what] / self._seconds
 
     def _means(self) -> Duration:
-        """Means of the period, ms."""
+        """Mean durations in the period, ms."""
         known = self._durations or [Duration(math.nan, math.nan, math.nan)]
         return Duration(*(1e3 * sum(each) / len(known) for each in zip(*known, strict=True)))
 
 
 def trouble_of_period(state: SessionState, rates: Rates, silent: SilentTopics) -> str:
-    """Text on the problem of the last period, with its cause; '' without a problem."""
+    """Description of the last period's problem and its cause; '' without a problem."""
     name, why = rates.name, '; '.join(silent.texts.values())
     if rates.change['dropped']:
         held_up = f'waits for {state.held_up}' if state.held_up else rates.computing
@@ -113,17 +113,17 @@ def trouble_of_period(state: SessionState, rates: Rates, silent: SilentTopics) -
 class MiddlewareEvents:
     """Counts lost messages and incompatible publishers and subscriptions; warns once per kind.
 
-    Only the executor's thread may call callbacks and `forget`; other methods are thread-safe.
+    Only the executor's thread may call the callbacks and `forget`; other methods are thread-safe.
     """
 
     def __init__(self, warn: Callable[[str], None]) -> None:
         self._warn = warn
         self._counts: Counter[str] = Counter()
-        # QoS policy in which the last incompatible publisher or subscription differs, by topic.
+        # Name of the QoS policy that caused the last incompatibility, by topic.
         self._policies: dict[str, str] = {}
 
     def of_subscription(self, topic: str) -> SubscriptionEventCallbacks:
-        """Callbacks for a subscription to a topic, by its full name."""
+        """Event callbacks for a subscription to a topic, which is given by its full name."""
 
         def lost(event: Any) -> None:
             count = event.total_count_change
@@ -139,7 +139,7 @@ class MiddlewareEvents:
         return SubscriptionEventCallbacks(**callbacks, message_lost=lost)
 
     def of_publisher(self, topic: str) -> PublisherEventCallbacks:
-        """Callbacks for a publisher of a topic, by its full name."""
+        """Event callbacks for a publisher of a topic, which is given by its full name."""
         callbacks = self._misfits(
             topic,
             'subscriptions to',
@@ -151,7 +151,7 @@ class MiddlewareEvents:
     def _misfits(
         self, topic: str, partners: str, words: tuple[str, str, str], effect: str
     ) -> dict[str, Callable[[Any], None]]:
-        """Callbacks for publishers or subscriptions with another QoS policy or message type."""
+        """Callbacks for the events that report an incompatible QoS policy or message type."""
         wants, than, has = words
 
         def incompatible(event: Any) -> None:
@@ -171,7 +171,7 @@ class MiddlewareEvents:
         return {'incompatible_qos': incompatible, 'incompatible_type': other_type}
 
     def deaf_topic(self, subscriptions: Iterable[Any]) -> str:
-        """Text on a topic whose publishers all have an incompatible quality of service, or ''."""
+        """Warning about a topic whose publishers all have an incompatible QoS policy, or ''."""
         # Another thread may close the subscriptions at the same time.
         with suppress(InvalidHandle):
             for subscription in list(subscriptions):
@@ -196,7 +196,7 @@ class MiddlewareEvents:
         ]
 
     def forget(self) -> None:
-        """Forgets incompatible publishers; those that still exist are found again."""
+        """Forgets incompatible publishers; new subscriptions detect any that still exist."""
         self._policies.clear()
 
     def _count(self, what: str, count: int, text: str) -> None:
@@ -206,7 +206,7 @@ class MiddlewareEvents:
 
 
 def _policy(event: Any) -> str:
-    """Name of the incompatible policy."""
+    """Name of the incompatible QoS policy."""
     try:
         return str(qos_policy_name_from_kind(event.last_policy_kind)).lower()
     except ValueError:

@@ -6,8 +6,8 @@ whose other inputs have all arrived. Only older images are dropped.
 
 The sessions that contribute to a pose share one thread and take turns, in the order in which they
 use each other's results. Sessions that can wait for the pose have a second thread, which handles a
-message when the first one is idle, or once the message has waited for `MAX_WAIT`. The messages
-of a session keep their order, so its results do not depend on turns.
+message when the first thread is idle, or once the message has waited for `MAX_WAIT`. The messages
+of a session stay in order, so that its results do not depend on the turns.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MAX_WAIT = 0.1
 # Number of recently decoded images that the sessions of a process share.
 MAX_SHARED_IMAGES = 4
 _RESTART = 'restart'
-# Maximum number of recently dropped images that are reported singly; others are only counted.
+# Maximum number of dropped images that are reported individually; older drops are only counted.
 _MAX_REPORTED_DROPS = 100
 # Maximum number of images whose arrival times are remembered, to measure the latency.
 _MAX_ARRIVAL_TIMES = 1000
@@ -59,7 +59,7 @@ class Waiting(NamedTuple):
 
 
 def received(data: bytes, of: SubscribedTopic) -> Waiting:
-    """Return a message that has just arrived; it is read at most once for all sessions."""
+    """Return the queue entry of a new message, which is read at most once for all sessions."""
     read: Callable[[], Any] = cache(partial(deserialise, data, of.msgtype))
     if len(data) > of.largest:
         # Does not keep the oversized message in memory.
@@ -73,12 +73,12 @@ def _refuse(why: str) -> NoReturn:
 
 
 class Duration(NamedTuple):
-    """Times that an estimate took.
+    """Computing times of an estimate.
 
     Attributes:
         latency: time from the arrival of the image or other message to the last result, s.
         whole: time from reading the message to publishing the last result, s.
-        publishing: part of `whole` for serialising and publishing, s.
+        publishing: part of `whole` spent on serialising and publishing, s.
     """
 
     latency: float
@@ -128,7 +128,7 @@ class InputQueue:
             self._limits[source] = most
 
     def put(self, waiting: Waiting) -> None:
-        """Adds a message or request; above the limit of its source, drops the oldest one."""
+        """Adds a message or request; drops the oldest of its source if too many are waiting."""
         source = waiting.source
         with self._changed:
             if self._closed:
@@ -147,7 +147,7 @@ class InputQueue:
             self._changed.notify_all()
 
     def take(self, most: int | None = None) -> Arrived:
-        """Takes out all messages, or the first `most`."""
+        """Removes and returns all messages, or only the first `most` messages."""
         with self._changed:
             count = len(self._waiting) if most is None else min(most, len(self._waiting))
             taken = tuple(self._waiting.popleft() for _ in range(count))
@@ -158,7 +158,7 @@ class InputQueue:
             return result
 
     def close(self) -> Arrived:
-        """Closes the queue to new messages; returns the waiting ones."""
+        """Closes the queue to new messages; returns the waiting messages."""
         with self._changed:
             self._closed = True
             return self.take()
@@ -177,7 +177,7 @@ class InputQueue:
 class EstimatingThread:
     """A thread that runs several estimators in turn.
 
-    The public methods may be called by any other thread.
+    Other threads may call the public methods.
 
     Args:
         changed: condition shared by all estimating threads of the process and their queues.
@@ -265,18 +265,18 @@ class EstimatingThreads:
 
 
 class Estimator:
-    """Handles the messages of a session, and reports on each.
+    """Handles the messages of a session, and reports on each message.
 
     All methods except `handle` are thread-safe.
 
     Args:
-        session: session to run; only the thread uses it, until `stop` has returned True.
+        session: session to run; no other thread may use it until `stop` has returned True.
         thread: thread that runs the estimator.
-        place: rank of the estimator in the order in which the thread gives turns.
+        place: rank of the estimator in the order of turns.
         report: function that receives the report on each message.
-        report_change: function that is called when status or kinds of faults of the session change.
-        report_error: function that receives an unexpected error of the session, and returns a line
-            that names it.
+        report_change: function that is called after a change of status or a new kind of fault.
+        report_error: function that receives an unexpected error of the session, and returns a
+            one-line description.
 
     Attributes:
         queue: waiting messages and requests.
@@ -317,7 +317,7 @@ class Estimator:
         self.queue.put(Waiting(_RESTART, action, time.monotonic()))
 
     def take_limit(self) -> None:
-        """Sets the limit of waiting images or mixtures to `most_waiting` of the session."""
+        """Limits the number of waiting images or mixtures to the session's `most_waiting`."""
         self.queue.limit(self._session.COUNTED, self._session.most_waiting)
 
     def take_durations(self) -> list[Duration]:
@@ -341,7 +341,7 @@ class Estimator:
         return True
 
     def handle(self, arrived: Arrived) -> None:
-        """Handles messages and reports dropped images; only the thread calls this."""
+        """Handles messages and reports dropped images; only the estimating thread calls this."""
         session = self._session
         session.count_dropped(arrived.dropped - len(arrived.stamps_ns))
         for stamp in arrived.stamps_ns:
@@ -381,8 +381,8 @@ class Estimator:
         else:
             handled = session.take(waiting.source, message, more=more)
         if more_done := session.state.counts[session.DONE] - done:
-            # Latency is measured from the image, which may have waited for this message. Stamps
-            # of forecasts are in the future.
+            # Latency is measured from the image, which may have waited for this message.
+            # Forecasts are excluded, because their stamps are in the future.
             stamps = (stamp for topic, stamp in handled.published if 'forecast' not in topic)
             newest = max(stamps, default=0)
             arrival = self._arrivals.get(newest, waiting.arrival)

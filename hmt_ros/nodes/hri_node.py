@@ -1,7 +1,7 @@
 """hri_node: mixtures of people in, the topics and frames of REP 155 out; around a session.
 
-Topics of a body exist as long as the body. Four times a second the node subscribes to mixtures of
-people in new namespaces, and unsubscribes from topics without a publisher.
+The topics of a body exist as long as the body. Four times a second the node subscribes to mixtures
+in new namespaces, and unsubscribes from topics without a publisher.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _SEARCH_PERIOD = 0.25
 class HriNode(SessionNode[HriSession, HriParameters]):
     """The node; its parameters are the fields of `HriParameters`.
 
-    It declares a parameter `human_description_<id>` with the URDF of each body (REP 155).
+    For each body the node declares a parameter `human_description_<id>` with the URDF (REP 155).
     """
 
     NAME = 'hri_node'
@@ -56,7 +56,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
-        # Publishers of bodies, by topic. Only the estimating thread uses them.
+        # Publishers for the bodies, by topic. Only the estimating thread uses them.
         self._of_bodies: dict[str, Any] = {}
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._search = self.create_timer(_SEARCH_PERIOD, self._find_people, clock=steady)
@@ -125,7 +125,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
                 message_class(msgtype),
                 topic,
                 qos,
-                # Without event handlers, which the executor's thread would call.
+                # No event handlers, because the executor's thread would call them.
                 event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
             )
         return self._of_bodies[topic]
@@ -150,7 +150,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
         self._forget_bodies(set() if session is None else session.identities)
 
     def _forget_bodies(self, kept: set[str]) -> None:
-        """Deletes the topics and parameters of bodies that are gone."""
+        """Deletes the topics and parameters of bodies that have ended."""
         for topic in list(self._of_bodies):
             identity, _, name = topic.removeprefix(f'{BODIES}/').partition('/')
             if identity in kept:

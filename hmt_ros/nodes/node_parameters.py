@@ -34,7 +34,7 @@ from hmt_ros.sessions.parameter_file import MAX_FILE_BYTES, PARAMETERS_KEY
 from msg_tools.files.plain_yaml import read_plain_yaml
 
 QOS_OVERRIDES = 'qos_overrides.'
-# Minimum similarity of a name to a suggestion; larger for nodes, whose names are similar.
+# Minimum similarity of a suggested parameter or node; node names resemble each other more.
 _MIN_SIMILARITY, _MIN_NODE_SIMILARITY = 0.5, 0.8
 
 
@@ -42,7 +42,7 @@ def declare(node: Node, defaults: Settings) -> Settings:
     """Declares the parameters of a settings dataclass.
 
     Args:
-        defaults: dataclass with the default values.
+        defaults: settings with the default values.
 
     Returns:
         The values given to the node.
@@ -67,7 +67,7 @@ def descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:
     result = ParameterDescriptor(
         description=f'{parameter.description} {EFFECTS[parameter.effect]}',
         read_only=parameter.effect == AT_LAUNCH,
-        # In ROS an empty list and a list of integers have other types than a list of floats.
+        # In ROS, an empty list or a list of integers does not have the type of a list of floats.
         dynamic_typing=isinstance(parameter.default, tuple),
     )
     if parameter.limits is not None:
@@ -82,7 +82,7 @@ def descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:
 
 
 def with_empty_lists(parameters: Iterable[Parameter], names: Set[str]) -> list[Parameter]:
-    """Parameters to set; list parameters without a value get an empty list.
+    """Replaces the unset values of list parameters by empty lists.
 
     ROS tools send an empty list as an unset value, and rclpy would delete an unset parameter.
 
@@ -101,7 +101,7 @@ def refuse(response: Any, asked: int, reason: str) -> None:
     """Fills the response to a refused request.
 
     Args:
-        asked: number of parameters that the request sets.
+        asked: number of parameters in the request.
     """
     refused = SetParametersResult(successful=False, reason=reason)
     if hasattr(response, 'results'):
@@ -129,7 +129,7 @@ def unknown_parameters(given: Iterable[str], known: Iterable[str]) -> list[str]:
 
 
 def file_folders(given: str) -> tuple[str, ...]:
-    """Folders in which parameters of a running node may name files.
+    """Folders that may contain the files named by parameters of a running node.
 
     Args:
         given: value of the parameter `file_folders`.
@@ -139,7 +139,7 @@ def file_folders(given: str) -> tuple[str, ...]:
         # Any of these folders may be missing.
         with suppress(PackageNotFoundError, RuntimeError, OSError):
             usual.append(str(find()))
-    # A service whose home or working folder is the root must not open all files.
+    # If its home or working folder is the root, a service must not give access to all files.
     named = given.split(':') if given else [folder for folder in usual if folder != '/']
     return tuple(dict.fromkeys(filter(None, named)))
 
@@ -151,9 +151,9 @@ def next_step(node: Node) -> str:
 
 
 def files_for_others(arguments: Iterable[str], node: str) -> list[str]:
-    """Warnings about parameter files with a section for a similar name, but none for the node.
+    """Warnings about parameter files that configure a similarly named node, but not this one.
 
-    A file for other nodes gives no warning: one file may serve many nodes.
+    A file for nodes with different names causes no warning, as one file may serve many nodes.
 
     Args:
         node: full name of the node.
@@ -165,7 +165,7 @@ def files_for_others(arguments: Iterable[str], node: str) -> list[str]:
         try:
             document = read_plain_yaml(Path(path), MAX_FILE_BYTES)
         except ValueError:
-            # ROS accepted this file, so it is valid YAML, but not in the plain subset.
+            # ROS has accepted this file, so it is valid YAML, but it is not plain YAML.
             continue
         sections = list(_sections(document, '')) if isinstance(document, Mapping) else []
         if any(re.fullmatch(_pattern(section), node) for section in sections):
@@ -182,7 +182,7 @@ def files_for_others(arguments: Iterable[str], node: str) -> list[str]:
 
 
 def _sections(document: Mapping[Any, Any], prefix: str) -> Iterator[str]:
-    """Names, with namespaces, of the nodes with a section in a parameter file."""
+    """Full names of the nodes that have a section in a parameter file."""
     for key, value in document.items():
         name = f'{prefix}/{str(key).strip("/")}'
         if key == PARAMETERS_KEY:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import threading
 from collections import deque
 
-# Maximum number of messages that may still return; the oldest are dropped, as some middleware
-# returns none.
+# Maximum number of sent messages that are remembered; the oldest are forgotten, because some
+# middleware never returns a node's own messages.
 _MAX_OWN_MESSAGES = 1000
 
 
 class OwnMessages:
-    """Messages on topics that a node both publishes and subscribes to; thread-safe."""
+    """Recognises a node's own messages on topics that it also subscribes to; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -23,7 +23,7 @@ class OwnMessages:
             self._waiting.append(_key(data))
 
     def is_own(self, data: bytes) -> bool:
-        """Whether a received message was sent by this node; each sent message returns once."""
+        """Whether a received message was sent by this node; recognises each message once."""
         key = _key(data)
         with self._lock:
             if known := key in self._waiting:
@@ -32,5 +32,5 @@ class OwnMessages:
 
 
 def _key(data: bytes) -> bytes:
-    """The message without its CDR header, and without trailing padding of the middleware."""
+    """The message without its CDR header and without the middleware's trailing padding."""
     return bytes(data[4:]).rstrip(b'\0')

@@ -1,7 +1,7 @@
-"""Reads the files of parameters in a separate thread, for which the node waits only briefly.
+"""Reads files named by parameters, in a separate thread for which the node waits only briefly.
 
-A Python thread can not be stopped. A slow reader continues in the background, and a repeated
-request gets its result.
+A Python thread can not be stopped, so a slow reader continues in the background. Repeating the same
+request later returns the result.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from concurrent.futures import Future, wait
 from threading import Thread
 from typing import Any
 
-# Maximum time that a node waits for a reader, s, and maximum fraction of its time that it spends
-# waiting, so that many requests do not block it.
+# Maximum time that a node waits for a reader, s, and maximum fraction of time spent waiting, which
+# keeps many requests from blocking the node.
 MAX_WAIT, MAX_TIME_SHARE = 0.6, 0.5
 _POLLING_PERIOD = 0.01
 
 
 class PatientReader:
-    """Reads for one request at a time; not thread-safe."""
+    """Executes one request to read files at a time; not thread-safe."""
 
     def __init__(self) -> None:
         # The present request and its result.
@@ -36,12 +36,12 @@ class PatientReader:
             meanwhile: function that is called repeatedly during the wait.
 
         Raises:
-            ValueError: other files are being read, or these are not read yet; one line.
+            ValueError: this or an earlier request is still in progress (one-line message).
             Exception: raised by the action.
         """
         if self._asked is None or (self._asked[0] != of and self._asked[1].done()):
             self._asked = of, Future()
-            # Not a pool, because the process would join its threads at exit.
+            # Not a thread pool, because the process would wait for its threads at exit.
             Thread(target=_do, args=(action, self._asked[1]), name='read', daemon=True).start()
         asked, result = self._asked
         if asked != of:

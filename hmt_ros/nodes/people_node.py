@@ -22,8 +22,8 @@ from hmt_ros.sessions.track import person_of
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from hmt_ros.sessions.tracking_parameters import PeopleParameters
 
-# Number of diagnostics periods from the end of a track until the topics of the person close: the
-# last messages must still arrive.
+# Number of diagnostics periods from the end of a track until the person's topics close, so that the
+# last messages still arrive.
 CLOSING_PERIODS = 5
 
 

@@ -53,7 +53,7 @@ def used_of_each_other(names: Sequence[str]) -> dict[str, dict[str, Any]]:
         }
         values[FilterNode.NAME] = {name: use for name, use in used.items() if use}
         if BmeNode.NAME in names:
-            # While the person is tracked, the filter needs the processor more.
+            # While the person is tracked, the filter needs more processor time.
             values[BmeNode.NAME] = {'tracked_interval': TRACKED_INTERVAL}
     return values
 
@@ -73,7 +73,7 @@ def nodes_together(names: Sequence[str], **options: Any) -> list[SessionNode[Any
 
 
 def main(args: list[str] | None = None) -> int:
-    """Runs the nodes until a signal stops them; returns 0, 1 if one does not start, 2 on misuse."""
+    """Runs the nodes until a signal; returns 0, 1 if a node can not start, 2 on wrong arguments."""
     arguments = sys.argv[1:] if args is None else args
     if wants_help(arguments):
         sys.stdout.write(_USAGE)

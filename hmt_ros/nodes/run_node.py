@@ -32,8 +32,8 @@ OWNER_VARIABLE = 'HMT_ROS_OWNER'
 
 # Parameter of mallopt(3) for the maximum number of heaps.
 _ARENA_MAX = -8
-# Time after which a thread yields Python's lock to another, s. With the default of 5 ms, a busy
-# thread would delay the others by this time after each of their calls of compiled code.
+# Time after which a thread yields Python's lock, s. With the default of 5 ms, a busy thread would
+# delay every other thread by 5 ms after each call of compiled code.
 _SWITCH_INTERVAL = 0.0005
 # Maximum time that a stopping node waits for its last estimate, s.
 _LAST_ESTIMATE_TIME = 5.0
@@ -53,17 +53,17 @@ def run(kind: type[SessionNode[Any, Any]], args: list[str] | None = None) -> int
 def run_together(
     name: str, make: Callable[[], Sequence[SessionNode[Any, Any]]], arguments: list[str]
 ) -> int:
-    """Runs nodes in this process until a signal stops it; returns 0, or 1 if one could not start.
+    """Runs nodes until a signal stops the process; returns 0, or 1 if a node could not start.
 
     Args:
         make: function that creates the nodes; called after ROS is initialised.
         arguments: command-line arguments, which are passed to ROS.
     """
     _use_one_heap()
-    # OpenCV's threads wait actively; on camera images they cost more than they save.
+    # OpenCV's threads busy-wait, which costs more than it saves on images of camera size.
     cv2.setNumThreads(1)
     sys.setswitchinterval(_SWITCH_INTERVAL)
-    # The handlers of rclpy would end the context during work; these let the work finish.
+    # rclpy's own handlers would shut down the context during an estimate; these let it finish.
     stopped = threading.Event()
     on_signals(lambda *_: stopped.set())
     try:
@@ -80,7 +80,7 @@ def run_together(
             node.get_logger().warn(text)
     for node in nodes:
         node.start()
-    # If the parent process is killed, it can not stop the node, which then ends by itself.
+    # A killed parent process can not stop the node; the node then ends by itself.
     owner = os.environ.get(OWNER_VARIABLE)
     while not stopped.is_set() and owner in (None, str(os.getppid())):
         _spin_once(executor, nodes)
@@ -99,17 +99,17 @@ def run_together(
 def _use_one_heap() -> None:
     """Makes all threads allocate from one heap, if the C library supports it.
 
-    Image buffers pass from thread to thread, which fragments a heap per thread, so that the process
-    would keep growing. Under Python's lock, threads hardly wait for the one heap.
+    Image buffers pass from thread to thread. With one heap per thread, fragmentation would make the
+    process grow without limit. Under Python's lock, threads rarely wait for the common heap.
     """
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)
 
 
 def _new_executor() -> Executor:
-    """An events executor; other executors search all topics of all nodes for each message.
+    """Return an events executor; other executors search all topics of all nodes for each message.
 
-    It raises the rate of processed images by a quarter. The first releases of Jazzy lack it.
+    The events executor processes a quarter more images per second. Early Jazzy releases lack it.
     """
     try:
         from rclpy.experimental import EventsExecutor
@@ -120,14 +120,14 @@ def _new_executor() -> Executor:
 
 def _spin_once(executor: Executor, nodes: Sequence[SessionNode[Any, Any]]) -> None:
     try:
-        # A timeout, because a signal does not wake a thread that waits for messages.
+        # The timeout is needed because a signal does not wake a thread that waits for messages.
         executor.spin_once(timeout_sec=0.2)
     except Exception as error:  # noqa: BLE001
         # The node survives errors of rclpy, for example if /clock is negative.
         text = f'{type(error).__name__}: {error_line(error)}'
         nodes[0].get_logger().error(f'a callback failed: {text}', throttle_duration_sec=1.0)
-        # Messages that arrived together with this one would stay unread; adding the nodes again
-        # makes the executor count them.
+        # Messages that arrived together with the failed one would stay unread; adding the nodes
+        # again makes the executor find them.
         for node in nodes:
             executor.remove_node(node)
             executor.add_node(node)
@@ -141,7 +141,7 @@ def wants_help(arguments: Iterable[str]) -> bool:
 def usage(kind: type[SessionNode[Any, Any]]) -> str:
     """The help of a node: usage, and all parameters with types, ranges, defaults and effects."""
     name = kind.NAME
-    # "<name>: what comes in, what goes out; how it is made."
+    # First line of a module: "<name>: <inputs> in, <outputs> out; <remarks>."
     module = sys.modules[kind.__module__].__doc__ or name
     purpose = module.splitlines()[0].partition(';')[0].rstrip('.')
     published = ', '.join(kind.SESSION.TOPICS)

@@ -4,8 +4,8 @@ The executor's thread only queues messages and answers services; another thread 
 Messages pass the middleware as bytes, so that nodes and offline commands read and write them with
 the same code.
 
-Nodes of one process share their threads. They pass messages to each other unserialised, and the
-first node that listens to a topic of another process subscribes to it for all.
+Nodes of one process share their threads and pass messages to each other unserialised. If several
+nodes need a topic of another process, one node subscribes on behalf of all.
 
 `~/handled` (hmt_msgs/Handled) reports every received message, once all its results are published.
 A player that waits for this report runs in lock step with the node.
@@ -81,11 +81,11 @@ MAX_PARAMETERS = 256
 
 
 class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
-    """A node around a session; its parameters are those of a settings dataclass.
+    """A lifecycle node around a session; a settings dataclass defines the parameters.
 
     Args:
         defaults: default values of the parameters; None: `DEFAULTS`.
-        beside: another node of this process, to share its threads; None: this node is the first.
+        beside: node of this process whose threads are shared; None for the first node.
         options: keyword arguments of `rclpy.lifecycle.LifecycleNode`.
 
     Attributes:
@@ -146,7 +146,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._failure = ''
         # Report on the last backward jump of the clock, and the time when it was first seen, s.
         self._jump = '', 0.0
-        # Number of internal errors of the node, and the text of the last one.
+        # Number of internal errors of the node, and the last error message.
         self._errors, self._last_error = 0, ''
         self._told_at = self._untold = 0
         self._told_status = ''
@@ -163,7 +163,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(1.0, self._diagnose_period, clock=steady)
 
-    # Overridden by each node.
+    # Methods that nodes override.
 
     def _offered_topics(self) -> Iterable[str]:
         """Topics that the node publishes; the nodes of this process receive them directly."""
@@ -179,10 +179,10 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
 
     @abstractmethod
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
-        """Topics to subscribe to; the messages of the last one trigger estimates."""
+        """Topics to subscribe to; the messages of the last topic trigger estimates."""
 
     def _messages_of_others(self, settings: Parameters) -> Mapping[str, str]:
-        """Message types that other packages must provide, each with the name of its user.
+        """Message types from other packages, each mapped to the feature that needs it.
 
         Raises:
             ValueError: no suitable package is installed.
@@ -226,7 +226,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         """Fills a field of a response with a message that the session makes.
 
         Raises:
-            ValueError: there is no session.
+            ValueError: the node is not configured.
         """
         if self._session is None:
             raise ValueError('the node is not configured')
@@ -310,7 +310,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._connect(name)
 
     def _connect(self, name: str) -> None:
-        """Subscribes to a topic, unless a node of this process publishes or receives it."""
+        """Subscribes to a topic, unless a node of this process already publishes or receives it."""
         if any(name in one._offered_names or name in one._connected for one in self._nodes):
             return
         wanted = self._heard[name]
@@ -392,7 +392,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     # Parameters.
 
     def _warn_of_unknown(self, *, qos: bool) -> None:
-        """Warns about values given for parameters that the node does not have.
+        """Warns about values that are given for unknown parameters.
 
         Args:
             qos: True checks only the QoS overrides, which subscriptions declare; False checks
@@ -482,7 +482,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return [] if topic.startswith('/') else self._listeners(self._local_name(topic))
 
     def _local_name(self, topic: str) -> str:
-        """Name of a topic in this process; absolute topics, such as /tf, pass over ROS."""
+        """Name of a topic in this process; absolute topics, such as /tf, only pass over ROS."""
         if topic not in self._local_names:
             own = f'{self.get_fully_qualified_name()} {topic}'
             name = own if topic.startswith('/') else self.resolve_topic_name(topic)
@@ -508,7 +508,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._log_status(counts)
 
     def _log_status(self, counts: Counter[str]) -> None:
-        """Logs a line while messages arrive: at once after a status change, else periodically."""
+        """While messages arrive, logs the status after each change, and periodically in between."""
         if self._session is None or counts['received'] == self._told_at:
             return
         state, self._told_at = self._session.state, counts['received']
@@ -540,7 +540,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         return DiagnosticStatus.OK, f'{state.status}, {state.summary()}'
 
     def _hardware(self, state: SessionState | None) -> str:
-        """Name of the camera: the frame of its messages or, if unknown, their topic."""
+        """Name of the camera: its frame or, if the frame is unknown, the topic of its messages."""
         if state is not None and state.frame_id:
             return state.frame_id
         # The local name of an absolute topic starts with the name of the node.

@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 
 def on_signals(stop: Callable[..., None]) -> None:
-    """Calls a function when a signal asks the process to end; ignores signals during its exit.
+    """Calls `stop` on SIGINT and SIGTERM; ignores both signals while the process exits.
 
-    A terminal and "ros2 launch" send one signal each. Python restores the default handlers before
-    it exits, so the second signal would kill the process.
+    Both the terminal and "ros2 launch" send a signal. Python restores the default handlers before
+    it exits, so that the second signal would kill the process.
     """
     numbers = (signal.SIGINT, signal.SIGTERM)
     for number in numbers:

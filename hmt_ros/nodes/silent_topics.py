@@ -1,4 +1,4 @@
-"""Causes of silent topics: missing publishers, other message types, and similar topic names.
+"""Explains silent topics: no publisher, the wrong message type, or a similar topic name.
 
 All methods but `arrived` run in the executor's thread, once per period of the diagnostics. They
 query the ROS graph only for topics on which nothing arrives.
@@ -17,12 +17,12 @@ from hmt_ros.nodes.subscribed_topic import SubscribedTopic
 from hmt_ros.sessions.handled import HANDLED
 from hmt_ros.sessions.session import NeededInput, kind_of
 
-# Time without a message after which a topic is silent, and interval of repeated warnings, s.
+# Time without a message after which a topic is reported as silent, and interval of warnings, s.
 SILENCE_TIME, WARNING_INTERVAL = 3.0, 30.0
-# Maximum number of topics that are suggested instead.
+# Maximum number of suggested topics.
 _MAX_SUGGESTIONS = 3
 _IMAGE, _COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
-# Value of `image_transport`, and topic of the subscription, by type of the images.
+# Value of `image_transport` and subscribed topic, by image type.
 _TRANSPORTS = {_IMAGE: ('raw', 'image'), _COMPRESSED: ('compressed', 'image/compressed')}
 
 
@@ -53,13 +53,13 @@ class SilentTopics:
 
     @property
     def silence(self) -> float:
-        """Time since the last message that triggered an estimate, s; 0 while they arrive."""
+        """Time since the last message that triggered an estimate, s; 0 up to `SILENCE_TIME`."""
         last = self._arrivals.get(self._pace)
         since = 0.0 if last is None else time.monotonic() - last
         return since if since > SILENCE_TIME else 0.0
 
     def listen(self, inputs: Iterable[SubscribedTopic], pace: str = '') -> None:
-        """Restarts with other subscriptions; without subscriptions, nothing is silent.
+        """Watches new subscriptions instead of the previous ones; an empty list stops the watch.
 
         Args:
             pace: source of the messages that trigger estimates.
@@ -76,7 +76,7 @@ class SilentTopics:
         self._arrivals[source] = self._arrivals[kind_of(source)] = now
 
     def check(self, needed: Iterable[NeededInput]) -> None:
-        """Finds silent topics among the needed ones, and warns about them."""
+        """Finds silent topics among the needed inputs, and warns about them."""
         now = time.monotonic()
         newest = self._arrivals.get(self._pace, self._began)
         silent = [one for one in needed if self._is_silent(one, newest if one.with_each else now)]
@@ -99,10 +99,10 @@ class SilentTopics:
         return now - last >= SILENCE_TIME
 
     def _like(self, wanted: list[SubscribedTopic], names: list[str]) -> list[Publication]:
-        """Publications of other nodes on topics `names`, or of a type that `wanted` could have.
+        """Publications of other nodes on the topics `names`, or with a type that suits `wanted`.
 
-        Silhouettes and overlays of the nodes of this package are left out: they are not camera
-        images.
+        Silhouettes and overlays published by this package are left out, because they are not
+        camera images.
         """
         own = self._node.get_fully_qualified_name()
         topics = dict(self._node.get_topic_names_and_types())
@@ -123,7 +123,7 @@ class SilentTopics:
 def why_silent(
     wanted: list[SubscribedTopic], names: list[str], published: list[Publication]
 ) -> str:
-    """Text on why a topic, with its alternatives, is silent, and the remedy."""
+    """Explanation of why a topic and its alternatives are silent, with a remedy."""
     topics = ' or '.join(
         f'{name} ({_short(one.msgtype)})' for one, name in zip(wanted, names, strict=True)
     )
@@ -143,9 +143,9 @@ def why_silent(
 
 
 def _instead(wanted: SubscribedTopic, name: str, published: list[Publication]) -> str:
-    """Text that suggests other topics, the most similar names first; '' without any."""
+    """Suggestion of other topics, the most similar names first; '' without candidates."""
     kinds = _TRANSPORTS if _is_image(wanted) else {wanted.msgtype: ('', wanted.topic)}
-    # Topics of the wanted type precede those of the other transport.
+    # Topics of the wanted type precede topics of the other image transport.
     for kind in sorted(kinds, key=lambda each: each != wanted.msgtype):
         transport, topic = kinds[kind]
         there = sorted({x.topic for x in published if x.msgtype == kind})

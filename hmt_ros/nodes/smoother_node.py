@@ -1,7 +1,7 @@
 """smoother_node: likelihood mixtures in, smoothed poses and trajectories out; around a session.
 
-A node can not detect the end of a stream: at deactivation it publishes the poses that are still
-open, and reports on `~/handled` with the source 'finish'.
+A node can not detect the end of a stream. When it is deactivated, it publishes the remaining poses
+and a report on `~/handled` with the source 'finish'.
 """
 
 from __future__ import annotations

@@ -20,8 +20,8 @@ from msg_tools.messages.message_types import register_definitions
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
 RELIABLE_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-# For `~/handled`: a client that waits for each report must not miss the reports on a burst. One
-# turn of the estimating thread reports up to 100 dropped messages, and all waiting messages.
+# A client of `~/handled` that waits for each report must not miss any in a burst of reports: one
+# turn of the estimating thread reports up to 100 dropped messages and all waiting messages.
 HANDLED_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED_QOS = QoSProfile(
     depth=1,
@@ -57,7 +57,7 @@ class SubscribedTopic(NamedTuple):
     waiting: int = SMALL_QUEUE
 
 
-# The same as in the listener of tf2.
+# The same QoS as in the listener of tf2.
 _TF_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 _TF_STATIC_QOS = QoSProfile(
     depth=100,
@@ -74,7 +74,7 @@ CAMERA_INFO_TOPIC = SubscribedTopic(CAMERA_INFO, 'camera_info', 'sensor_msgs/msg
 
 
 def image_topic(image_transport: str) -> SubscribedTopic:
-    """The images of a camera, 'raw' or 'compressed'."""
+    """The image topic for a transport, 'raw' or 'compressed'."""
     topic, kind = ('image', 'Image')
     if image_transport == 'compressed':
         topic, kind = ('image/compressed', 'CompressedImage')
@@ -82,7 +82,7 @@ def image_topic(image_transport: str) -> SubscribedTopic:
 
 
 def input_topics(rows: Iterable[ImageInput]) -> Iterator[SubscribedTopic]:
-    """Topics of the inputs that accompany the images, from rows of the table of inputs."""
+    """Topics of the inputs in `rows`, which accompany the images."""
     for row in rows:
         for source, msgtype in row.types.items():
             yield SubscribedTopic(
@@ -96,7 +96,7 @@ def input_topics(rows: Iterable[ImageInput]) -> Iterator[SubscribedTopic]:
 
 
 def types_of_others(rows: Iterable[ImageInput], source: str) -> dict[str, str]:
-    """Message types of other packages that a `source` needs, each with the name of its user."""
+    """Message types from other packages, each mapped to the `source` that needs it."""
     return {row.types[DETECTIONS]: f'source {source}' for row in rows if DETECTIONS in row.types}
 
 
@@ -106,7 +106,7 @@ def published_with(published: PublishedTopic) -> tuple[str, QoSProfile]:
 
 
 def mixture_topic(source: str, topic: str) -> SubscribedTopic:
-    """Pose mixtures of a person, with a queue for a subscriber that is slow for some seconds."""
+    """Topic of a person's pose mixtures, with a queue for the messages of several seconds."""
     return SubscribedTopic(source, topic, POSE_MIXTURE, _MIXTURE_QOS)
 
 
@@ -127,7 +127,7 @@ def read_installed_messages(msgtype: str, needed_by: str) -> None:
     """Reads the message definitions of an installed package.
 
     Args:
-        needed_by: name of the user of the messages, for the error.
+        needed_by: feature that needs the messages, for the error message.
 
     Raises:
         ValueError: the package is not installed.

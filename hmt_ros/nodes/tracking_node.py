@@ -1,7 +1,7 @@
-"""A node that tracks people: the common part of nodes for one person and for several.
+"""Base class of the nodes that track one person or several people.
 
-A watchdog publishes a warning for robots if no outputs for a new image were published for
-`stale_time`, by a monotonic clock.
+A watchdog with a monotonic clock publishes a warning for robots after a time `stale_time` without
+outputs for a new image.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class TrackingNode(SessionNode[Any, Any]):
 
     @abstractmethod
     def _start_asked_for(self, request: Reset.Request) -> TrackStart:
-        """Data that the new tracks start from, as requested.
+        """Data from which the new tracks start, as requested.
 
         Raises:
             ValueError: the request can not be used.

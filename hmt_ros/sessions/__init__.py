@@ -1,1 +1,1 @@
-"""Messages in, messages out, without ROS: the part that a node and an offline replay share."""
+"""The logic that nodes and offline replay share: messages in, messages out, without ROS."""

@@ -1,4 +1,4 @@
-"""Parameters of the BME node, which are the settings of offline replay as well."""
+"""Parameters of the BME node and of its offline replay."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hmt_ros.sessions.declared_parameters import (
     parameter_field,
 )
 
-# Cues that a prediction is made from.
+# Cues from which predictions are made.
 FROM_SILHOUETTES, FROM_KEYPOINTS, FROM_BOTH = 'silhouettes', 'keypoints', 'both'
 CUES = (FROM_SILHOUETTES, FROM_KEYPOINTS, FROM_BOTH)
 

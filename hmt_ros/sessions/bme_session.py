@@ -3,9 +3,9 @@
 The rules, in addition to those of `CameraSession`:
 
 - Every usable image gets one prediction. A prediction without components means that nobody was
-  seen (the silhouette is too low for a person) or, if `reason` is set, that the background is
+  seen (the silhouette is not tall enough) or, if `reason` is set, that the background is
   unknown because the scene has not been seen empty.
-- With `use_mask` the mask of an image is its silhouette; the background is not learned from an
+- With `use_mask` the mask of an image is used as silhouette; the background is not learned from an
   image whose mask shows somebody.
 - With `tracked_interval` the session subscribes to the track of the filter (`pose_mixture`). While
   the person is tracked, images within `tracked_interval` after the last prediction are not
@@ -95,7 +95,7 @@ _TOPICS_OF_NODE = {**TOPICS, SILHOUETTE: PublishedTopic('sensor_msgs/msg/Image')
 MIN_HEIGHT = 40
 # Maximum age of the previous prediction for propagation, s.
 MAX_INTERVAL = 0.5
-# Maximum time between an image and a message of the track that applies to the image, ns.
+# Maximum time between an image and the track message that is applied to it, ns.
 _TRACKED_TIME_NS = SECOND_NS
 # Relative standard deviation of the size of a person whose stature is known.
 _MEASURED_SPREAD = 0.02
@@ -105,8 +105,8 @@ _MEASURED_SPREAD = 0.02
 class BmeState(CameraState):
     """State of the predictor: its status is 'no camera', 'learning', 'nobody' or 'predicting'.
 
-    Counts: 'predicted' are all evaluated images, 'empty' the evaluated images without a person,
-    'left' the images that were not evaluated because the person is tracked.
+    Keys of `counts`: 'predicted' (evaluated images), 'empty' (evaluated images without a person),
+    'left' (images that were not evaluated because the person was tracked).
 
     Attributes:
         modes: number of components of the last prediction.
@@ -156,7 +156,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         # OpenCV's background model has an internal buffer, so only one thread may use it at a time.
         self._background_in_use = threading.Lock()
         self._height, self._support, self._reason = 0, math.nan, ''
-        # Whether the last prediction needed no background.
+        # Whether the last prediction was made without a background.
         self._without_background = p.predict_from == FROM_KEYPOINTS
         self._lifter = None if p.predict_from == FROM_SILHOUETTES else known_lifter(p.lifter)
         self._cue = p.predict_from
@@ -165,7 +165,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
     def restart(self) -> None:
         """See `Session`."""
-        # Last prediction, and its stamp, ns. The background is kept.
+        # Last prediction and its stamp, ns. A restart keeps the background.
         self._previous: tuple[GaussianMixture, int] | None = None
         # Stamps of the last evaluated image, and of the last message with a tracked person, ns.
         self._looked: int | None = None
@@ -267,7 +267,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if not in_turn or not self._is_tracked(stamp) or self._wanted(SILHOUETTE):
             super()._take_image(message, stamp)
             return
-        # The image is left to the track without being decoded.
+        # The image of a tracked person is neither decoded nor evaluated.
         self._newest = stamp
         self._skip_prediction(stamp, str(message.header.frame_id) or self._frame or FRAME_ID)
 
@@ -344,7 +344,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         return found.mixture
 
     def _usable_silhouette(self, waiting: WaitingImage) -> Mask:
-        """Return the silhouette of an image; it is empty until the scene has been seen empty."""
+        """Return the silhouette of an image; it has no pixels until the background is known."""
         scene, stamp = self._scene, waiting.stamp_ns
         with self._background_in_use:
             if scene.seen:
@@ -358,7 +358,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         return np.zeros(waiting.image.shape[:2], np.bool_)
 
     def _known_before(self, stamp_ns: int) -> tuple[GaussianMixture | None, float]:
-        """Return the previous prediction, if it is recent, and the time since then, s."""
+        """Return the previous prediction and its age, s; None and `STEP` if it is too old."""
         previous = self._previous
         if self.parameters.propagation == WITHOUT_PROPAGATION or previous is None:
             return None, STEP
@@ -385,7 +385,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         )
 
     def _publish_silhouette(self, of: WaitingImage, mask: Mask | None = None) -> None:
-        """Publishes the silhouette of an image; computes it if it is not given."""
+        """Publishes the silhouette of an image, which is computed if it is not given."""
         known = mask is not None or (of.mask is None and self._scene.known)
         if not known or not self._wanted(SILHOUETTE):
             return
@@ -417,7 +417,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         return pose_mixture_message(self._messages, content)
 
     def predict_once(self, message: Any) -> Any:
-        """Predicts from a single image, with the present background.
+        """Predicts the pose in a single image, with the present background.
 
         Thread-safe.
 

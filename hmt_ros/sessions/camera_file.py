@@ -1,8 +1,8 @@
 """Camera from a field of view, or from a calibration file.
 
-Calibration files are those of OpenCV (FileStorage: YAML, XML or JSON), of ROS (camera_calibration,
-or a camera_info as `ros2 topic echo --once` or `rostopic echo -n1` prints it), the camchain of
-kalibr, and the `.toml` of anipose, Pose2Sim and caliscope.
+A calibration file comes from OpenCV (FileStorage: YAML, XML or JSON), from ROS (camera_calibration,
+or a camera_info printed by `ros2 topic echo --once` or `rostopic echo -n1`), from kalibr
+(camchain), or from anipose, Pose2Sim or caliscope (`.toml`).
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ def camera_of_view(
 
     Args:
         size: width and height of the image, px.
-        horizontal: horizontal field of view, degrees; None: `vertical` is given.
-        vertical: vertical field of view, degrees; only used without `horizontal`.
+        horizontal: horizontal field of view, degrees; None selects `vertical`.
+        vertical: vertical field of view, degrees; ignored if `horizontal` is given.
         aspect: width of a pixel over its height.
     """
     width, height = size
@@ -96,10 +96,10 @@ def read_camera(path: Path, size: tuple[int, int], notify: Notify = lambda text:
         path: the file; FILE:NAME selects the camera NAME if the file has several cameras.
         size: width and height of the images, px; a calibration for another size of the same aspect
             ratio is scaled, and a calibration without a size is assumed to be for this size.
-        notify: function that is called with a line on each neglected or scaled entry.
+        notify: function that receives a line about each entry that is ignored or scaled.
 
     Raises:
-        ValueError: the file has no calibration, or one that is damaged or for another aspect ratio.
+        ValueError: the calibration is missing, damaged, or for another aspect ratio.
     """
     file, name = path, ''
     if not path.exists() and ':' in path.name:
@@ -125,7 +125,7 @@ def read_camera(path: Path, size: tuple[int, int], notify: Notify = lambda text:
 
 
 def _content(path: Path, text: str) -> tuple[Any, str]:
-    """Return the entries of a file, and the default model of the distortion."""
+    """Return the entries of a file, and the default distortion model."""
     if path.suffix.lower() == '.toml':
         if any(line.count('.') > _MAX_DOTS for line in text.splitlines()):
             raise ValueError(f'a line with more than {_MAX_DOTS} points')
@@ -133,7 +133,7 @@ def _content(path: Path, text: str) -> tuple[Any, str]:
     start = text.lstrip()
     if start.startswith('<?xml'):
         return _of_xml(start), 'pinhole'
-    # Removes long lists that are not needed: points of a calibration pattern, poses of its images.
+    # Removes long lists that are not needed, such as the points of a calibration pattern.
     text = _LONG_LIST.sub('"a long list"', start)
     of_opencv = start.startswith(('%YAML', '{'))
     if of_opencv:
@@ -168,7 +168,7 @@ def _of_element(element: ET.Element) -> Any:
 
 
 def _calibrations(content: Any, name: str = '') -> dict[str, dict[Any, Any]]:
-    """Return the tables that have a camera matrix, by name."""
+    """Return the tables of a file that contain a camera matrix, by name."""
     if not isinstance(content, dict):
         return {}
     if _first(content, _MATRIX_KEYS) is not None:
@@ -177,16 +177,16 @@ def _calibrations(content: Any, name: str = '') -> dict[str, dict[Any, Any]]:
 
 
 def _entries(content: dict[Any, Any], model: str, size: tuple[int, int]) -> dict[str, Any]:
-    """Return the entries of a camera_info.
+    """Return the fields of a camera_info, from a table with a calibration.
 
     Args:
-        model: default model of the distortion.
+        model: default distortion model.
     """
     k, d = (
         _numbers(_first(content, _MATRIX_KEYS)),
         _numbers(_first(content, _DISTORTION_KEYS) or []),
     )
-    if 4 <= len(k) <= 6:  # kalibr: parameters of models other than the pinhole precede these four
+    if 4 <= len(k) <= 6:  # kalibr: other models than the pinhole have parameters before these
         fx, fy, cx, cy = k[-4:]
         k = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
     given = _first(content, _WIDTH), _first(content, _HEIGHT)

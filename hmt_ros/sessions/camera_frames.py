@@ -1,7 +1,7 @@
 """Gravity, height and pose of the camera, from transforms to other frames.
 
 A frame with z up (`gravity_frame`) gives the direction of gravity and, if z = 0 is the floor, the
-height of the camera. A stationary frame (`fixed_frame`) gives the motion of the camera. They may be
+height of the camera. A stationary frame (`fixed_frame`) gives the motion of the camera. Both may be
 the same frame.
 """
 
@@ -36,7 +36,7 @@ class CameraFrames:
         floor: whether z = 0 of `gravity_frame` is the floor.
 
     Attributes:
-        newest: whether gravity was found at the last image.
+        newest: whether transforms gave the direction of gravity at the last image.
         heard: whether any transform was received.
         pose: pose of the camera in `fixed_frame` at the last image; None if unknown.
     """
@@ -46,7 +46,8 @@ class CameraFrames:
     ) -> None:
         self.gravity_frame = gravity_frame
         self.fixed_frame = fixed_frame
-        # Newest direction against gravity, and height above z = 0 of its frame, m; None: unknown.
+        # Newest direction against gravity, and height of the camera above z = 0 of `gravity_frame`,
+        # m; None: unknown.
         self._gravity: tuple[Array, float] | None = None
         self.newest = False
         self.pose: Transform | None = None
@@ -56,7 +57,7 @@ class CameraFrames:
 
     @property
     def wanted(self) -> bool:
-        """Whether there is a frame to look up."""
+        """Whether a frame is named, so that transforms are needed."""
         return bool(self.gravity_frame or self.fixed_frame)
 
     def take(self, message: Any, *, static: bool) -> list[str]:
@@ -65,12 +66,12 @@ class CameraFrames:
         return self._transforms.put(message, static=static)
 
     def forget_after(self, stamp_ns: int) -> None:
-        """See `TransformBuffer.forget_after`; gravity and pose are forgotten, too."""
+        """Forgets gravity, the pose, and the transforms after a stamp."""
         self._transforms.forget_after(stamp_ns)
         self._gravity, self.newest, self.pose = None, False, None
 
     def is_settled(self, camera_frame: str, stamp_ns: int, timeout_ns: float) -> bool:
-        """Whether an image need not wait: its transforms are known, or later ones have arrived."""
+        """Whether an image need not wait: its transforms or later transforms have arrived."""
         if self._transforms.has_later(stamp_ns, timeout_ns):
             return True
         try:
@@ -91,7 +92,7 @@ class CameraFrames:
         return gravity + pose
 
     def known_ground(self, otherwise: KnownGround) -> KnownGround:
-        """Return `otherwise`, with gravity and height of the newest transforms, if known."""
+        """Return gravity and height from the newest transforms, or `otherwise` without them."""
         if self._gravity is None:
             return otherwise
         up, height = self._gravity

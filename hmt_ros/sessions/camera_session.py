@@ -2,13 +2,13 @@
 
 Images are used in the order of their stamps. They wait for the first calibrated camera_info and for
 other inputs (`image_inputs`); if more than `MAX_INCOMPLETE_IMAGES` images wait, the oldest are
-dropped. A session is late if messages have arrived during an estimate while images waited for it.
-Then, of the images whose other inputs are complete, only the newest `queue_size` are used.
+dropped. A session is late if messages have arrived during an estimate while further images waited.
+It then uses only the newest `queue_size` of the images whose other inputs have arrived.
 
-If the parameters name a frame, an image also waits for the transforms of its stamp. This wait ends
-with an image or a transform that is `input_timeout` younger, and before the image would be dropped.
-Without its transforms the last known gravity applies, and the camera is assumed to continue its
-motion.
+If the parameters name a frame, an image also waits for the transforms of its stamp. The wait ends
+when an image or a transform that is `input_timeout` younger arrives, or when the image would have
+to be dropped. If transforms are missing, the last known gravity is used, and the camera is assumed
+to continue its motion.
 """
 
 from __future__ import annotations
@@ -59,12 +59,13 @@ CameraParameters = TypeVar('CameraParameters', bound=CameraNodeParameters)
 
 # Maximum number of images that wait for other inputs: half a second at a common image rate.
 MAX_INCOMPLETE_IMAGES = 16
-# Maximum size of the images that wait, bytes.
+# Maximum total size of the waiting images, bytes.
 MAX_INCOMPLETE_BYTES = 2**29
 _MAX_PICTURE_BYTES = 2**28  # bytes
-# Minimum length of the time window after an image in which a later input ends its wait, s.
+# Maximum time from an image to a later input that ends the wait for the missing input, s;
+# `input_timeout` replaces it if longer.
 _MIN_LEAD_TIME = 1.0
-# Maximum number of remembered frame names per source; a camera has one.
+# Maximum number of remembered frame names per source; a camera uses one name.
 _MAX_FRAMES = 8
 
 
@@ -213,7 +214,7 @@ class CameraSession(Session[CameraParameters, State]):
         self._fresh -= max(len(turn.use) - 1, 0)
 
     def _jump_back(self, first: int, last: int) -> None:
-        """See `Session`; waiting images are used or dropped, inputs of other times are dropped."""
+        """See `Session`; uses or drops the waiting images, and drops inputs of other times."""
         self._end()
         self._log.counts['dropped'] += len(self._waiting)
         self._waiting.clear()
@@ -270,7 +271,7 @@ class CameraSession(Session[CameraParameters, State]):
             self.restart()
 
     def _check_frame_id(self, source: str, message: Any) -> None:
-        """Warns once for each additional frame that the messages of a source name.
+        """Warns once about each unexpected frame_id in the messages of a source.
 
         This reveals two publishers on one topic, or the camera_info of another camera.
         """
@@ -329,12 +330,12 @@ class CameraSession(Session[CameraParameters, State]):
                 self._leave_out_late_images()
             while self._waiting and not self._left and self._is_ready(self._waiting[0]):
                 self._estimate_next(self._camera)
-                # Messages that have arrived meanwhile decide which image is next.
+                # Messages that have just arrived may change which image is next.
                 self._left = bool(self._waiting) and self.interrupted()
         self._drop_incomplete_images()
 
     def _leave_out_late_images(self) -> None:
-        """Drops all but the newest `queue_size` of the images that are ready."""
+        """Of the images that are ready, drops all but the newest `queue_size`."""
         ready = sum(1 for _ in takewhile(self._is_ready, self._waiting))
         for _ in range(ready - self.parameters.queue_size):
             self._drop(self._waiting.popleft().stamp_ns)
@@ -379,7 +380,7 @@ class CameraSession(Session[CameraParameters, State]):
         self._estimate(waiting._replace(frame_id=frame, given=given), camera)
 
     def _frame_of(self, waiting: WaitingImage) -> str:
-        """Return the optical frame named by the image, or else by the camera_info."""
+        """Return the optical frame named by the image or, if it names none, by the camera_info."""
         return waiting.frame_id or self._frame or FRAME_ID
 
     def _status_and_wants(self) -> tuple[str, str]:
@@ -390,7 +391,7 @@ class CameraSession(Session[CameraParameters, State]):
 
 
 def camera_info_fault(error: CameraInfoError, source: str) -> str:
-    """Return the text of a fault of a camera_info, with the remedy."""
+    """Return an error message about a camera_info, with the remedy."""
     text = f'{source}{str(error).removeprefix("camera info")}'
     if isinstance(error, UncalibratedError):
         return f'{text}; calibrate the camera, and let its driver publish the result'
@@ -398,7 +399,7 @@ def camera_info_fault(error: CameraInfoError, source: str) -> str:
 
 
 def camera_moved_fault(shift: float, stamp_ns: int, remedy: str) -> str:
-    """Return the text of a warning that the camera has moved, with the remedy.
+    """Return a warning that the camera has moved, with the remedy.
 
     Args:
         shift: shift of the scene, px; NaN: unknown.
@@ -422,10 +423,10 @@ def check_size(image: Image, camera: Camera) -> None:
 
 
 def read_picture(file: str) -> Image:
-    """Read the picture (H, W, 3), BGR, in the PNG or JPEG file of `background_file`.
+    """Read the PNG or JPEG file named by `background_file` as an image (H, W, 3), BGR.
 
     Raises:
-        ValueError: the file has no picture, or is too large.
+        ValueError: the file is not an image, or is too large.
     """
     with named_file('background_file', file, 'PNG or JPEG image'):
         try:

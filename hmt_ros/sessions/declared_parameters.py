@@ -1,9 +1,9 @@
 """Settings dataclasses as ROS parameters.
 
-A node is parametrised by a dataclass whose docstring describes the parameters and whose checks
-decide whether values go together. A field made by `parameter_field` is a parameter. A field with
-`nested_parameters` holds settings of a library class and lists which of them are parameters.
-Everything else can only be set by a program.
+A dataclass defines the parameters of a node. Its docstring describes them, and its checks reject
+inconsistent values. A field made by `parameter_field` is a parameter. A field with
+`nested_parameters` contains settings of a library class, and lists which settings are parameters.
+All other fields can only be set by a program.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any, ClassVar, TypeVar
 
 from hmt_ros.image.keypoint_schemes import AUTO, JOINTS, Scheme, schemes
 
-# A tuple is a list of numbers.
+# A tuple represents a list of numbers.
 Value = bool | int | float | str | tuple[float, ...]
 Limits = tuple[float, float] | None
 Settings = TypeVar('Settings')
@@ -43,24 +43,24 @@ FRACTION = (0.0, 1.0)
 
 TRANSPORTS = ('raw', 'compressed')
 MAX_TIMEOUT = 60.0  # s
-MAX_VALUE_LENGTH = 4096  # characters of a text, or entries of a list
+MAX_VALUE_LENGTH = 4096  # characters of a string, or entries of a list
 # Value of `source` for messages of this package.
 OWN_SOURCE = 'keypoints'
 
-# Scheme of keypoints that come without names, unless another is named.
+# Default scheme for the order of keypoints without names.
 USUAL_ORDER = 'coco17'
 
-# Metadata of a field that is one parameter or holds several.
+# Keys of the metadata of a field that is a parameter or contains parameters.
 _EFFECT, _LIMITS = 'effect', 'limits'
 
 
 def parameter_field(default: Value, effect: str, limits: Limits = None) -> Any:
-    """A field that is a parameter.
+    """A dataclass field that is a ROS parameter.
 
     Args:
-        default: its value unless another is given.
+        default: default value of the parameter.
         effect: when a new value takes effect; one of `EFFECTS`.
-        limits: lowest and highest value; None where the parameter is no number.
+        limits: lowest and highest value; None: no limits.
     """
     return dataclasses.field(default=default, metadata={_EFFECT: effect, _LIMITS: {'': limits}})
 
@@ -70,13 +70,13 @@ def nested_parameters(effect: str, parameters: Mapping[str, Limits]) -> Mapping[
 
     Args:
         effect: when new values take effect; one of `EFFECTS`.
-        parameters: the limits of those that are parameters, by name.
+        parameters: the settings that are parameters, each mapped to its limits or None.
     """
     return {_EFFECT: effect, _LIMITS: parameters}
 
 
 def check_choices(settings: Any, **choices: tuple[str, ...]) -> None:
-    """Raises ValueError where a field of settings has none of the values that it may have."""
+    """Raises ValueError if a field of the settings does not have an allowed value."""
     for name, values in choices.items():
         if (value := getattr(settings, name)) not in values:
             raise ValueError(f'{name} must be one of {values}, saw {value!r}')
@@ -149,7 +149,7 @@ class CameraNodeParameters(ImageNodeParameters):
     keypoint_scheme: str = parameter_field(AUTO, AT_ONCE)
     input_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, MAX_TIMEOUT))
 
-    # Values of `source`.
+    # Allowed values of `source`.
     SOURCES: ClassVar[tuple[str, ...]] = (OWN_SOURCE, 'skeleton2d', 'yolo', 'floats')
 
     def __post_init__(self) -> None:
@@ -158,21 +158,21 @@ class CameraNodeParameters(ImageNodeParameters):
 
     @property
     def order(self) -> Scheme:
-        """The scheme whose order keypoints without names follow."""
+        """The scheme that gives the order of keypoints without names."""
         return schemes().get(self.keypoint_scheme) or schemes()[USUAL_ORDER]
 
 
 @dataclass(frozen=True)
 class DeclaredParameter:
-    """A parameter.
+    """A ROS parameter that a settings dataclass declares.
 
     Attributes:
-        name: of the field.
-        default: its value unless another is given; its type is the type of the parameter.
-        description: one sentence or more.
-        limits: lowest and highest value, None where the parameter is no number.
+        name: name of the parameter and of its field.
+        default: default value, which has the type of the parameter.
+        description: description for users, in one or more sentences.
+        limits: lowest and highest value; None: no limits.
         effect: when a new value takes effect; one of `EFFECTS`.
-        path: names of the fields that lead from the settings to the value.
+        path: names of the nested fields that contain the value, outermost first.
     """
 
     name: str
@@ -191,10 +191,10 @@ class DeclaredParameter:
         return ' to '.join(format(limit, digits) for limit in self.limits)
 
     def checked(self, value: Any) -> Value:
-        """A value from a file or a command line, with the type of the parameter.
+        """Check a value from a file or a command line, and convert it to the parameter's type.
 
         Raises:
-            ValueError: another type, or beyond the limits.
+            ValueError: the value has the wrong type or exceeds the limits.
         """
         wanted: Any = type(self.default)
         if hasattr(value, '__len__') and len(value) > MAX_VALUE_LENGTH:
@@ -213,9 +213,9 @@ class DeclaredParameter:
         return wanted(value)
 
     def _numbers(self, value: Any) -> tuple[float, ...]:
-        """A list of numbers; to ROS an empty list is no value at all."""
+        """Convert a list of numbers to a tuple; ROS passes an empty list as None."""
         numbers = () if value is None else value
-        # ROS has bytes, whole numbers and texts in lists, too.
+        # Lists in ROS may also contain bytes, integers or strings.
         if not isinstance(numbers, list | tuple | array) or not all(
             type(number) in (int, float) for number in numbers
         ):
@@ -227,10 +227,10 @@ _NAMES = {bool: 'truth value', int: 'whole number', float: 'number', str: 'text'
 
 
 def declared_parameters(settings: Any) -> list[DeclaredParameter]:
-    """The parameters of a settings dataclass, those of the class before those of its bases.
+    """The parameters of a settings dataclass; inherited parameters come last.
 
     Args:
-        settings: an instance; its values are the defaults.
+        settings: instance with the default values.
     """
     places = {name: i for i, name in enumerate(vars(type(settings)).get('__annotations__', ()))}
     ordered = sorted(fields(settings), key=lambda field: places.get(field.name, len(places)))
@@ -248,7 +248,7 @@ def declared_parameters(settings: Any) -> list[DeclaredParameter]:
 
 
 def values_of(settings: Any) -> dict[str, Any]:
-    """Values of all parameters, by name, as a parameter file has them: tuples as lists."""
+    """Values of all parameters by name, as in a parameter file: tuples become lists."""
     return {
         p.name: list(p.default) if isinstance(p.default, tuple) else p.default
         for p in declared_parameters(settings)
@@ -256,11 +256,11 @@ def values_of(settings: Any) -> dict[str, Any]:
 
 
 def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
-    """The settings with some parameters changed.
+    """Return a copy of the settings with new values of some parameters.
 
     Raises:
-        ValueError: an unknown name, a value of another type or beyond its limits, or values that do
-            not go together, as the dataclasses say.
+        ValueError: a name is unknown, a value has the wrong type or exceeds its limits, or the
+            values are inconsistent.
     """
     known = {parameter.name: parameter for parameter in declared_parameters(settings)}
     for name in values:
@@ -284,12 +284,12 @@ def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
 
 @cache
 def described_fields(cls: type) -> dict[str, str]:
-    """The section 'Attributes:' of the docstrings of a class and its bases: one line by name."""
+    """Descriptions in the docstrings of a class and its bases, as a mapping from name to line."""
     result: dict[str, str] = {}
     for each in reversed(cls.__mro__):
         text = inspect.cleandoc(vars(each).get('__doc__') or '')
         _, _, section = text.partition('Attributes:\n')
-        # Ends where a line is not indented any more.
+        # The section ends before the first line that is not indented.
         block = re.split(r'\n(?=\S)', section, maxsplit=1)[0]
         for entry in re.split(r'\n(?=\S)', textwrap.dedent(block)):
             names, colon, words = entry.partition(':')

@@ -2,8 +2,8 @@
 
 The root of a pose refers to a frame with the axes of a camera: x right, y down, z forward. Mixtures
 are therefore published in the frame `<fixed_frame>_optical`, which has the origin of `fixed_frame`
-and these axes, provided that z of `fixed_frame` points up: the root angles of a standing person are
-then far from their poles, whichever way the person faces. `/tf` has the transform.
+and these axes. The z axis of `fixed_frame` must point up: the root angles of a standing person are
+then far from their poles, whichever way the person faces. The transform is published on `/tf`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hmt_ros.tracking.camera_motion import CameraMotion
 
 # Rotation to (x forward, y left, z up) from (x right, y down, z forward).
 OPTICAL_TO_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-# Sine of the angle between view and vertical below which the view has no heading.
+# Sine of the angle between optical axis and vertical below which the camera has no heading.
 _MIN_HEADING_SINE = 1e-3
 
 
@@ -34,7 +34,7 @@ class FixedFrame:
         name: name of the frame, whose z axis points up.
         camera: pose of the camera in the frame: p_fixed = R p_camera + t.
         turn: angle about z that the transform added to the root at the previous image, rad; it
-            determines the number of whole turns.
+            determines the number of whole turns at this image.
     """
 
     name: str
@@ -57,7 +57,7 @@ class FixedFrame:
     def placed(
         self, body: Body, mixture: GaussianMixture, velocities: Array | None = None
     ) -> tuple[GaussianMixture, Array | None]:
-        """Transform a mixture over poses in the camera frame, and velocities (K, d), if known.
+        """Transform a mixture and its velocities (K, d), if known, to the frame `optical`.
 
         Returns:
             Mixture and velocities in the frame `optical`, with root angles relative to its axes.
@@ -81,7 +81,7 @@ class FixedFrame:
 
 
 def upright(up: Array) -> Array:
-    """Return the rotation (3, 3) to the camera frame from the frame with z up and x forward.
+    """Return the rotation (3, 3) from a frame with x forward and z up to the camera frame.
 
     If the camera looks straight up or down, x points to the upper edge of the image.
 

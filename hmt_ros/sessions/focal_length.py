@@ -1,4 +1,4 @@
-"""Uncalibrated focal length, and the error of all depths that follows from it.
+"""Error of the depth of a person due to an uncalibrated focal length.
 
 An image gives the directions of the joints, and the lengths of the body give their distances.
 Therefore a focal length that is wrong by a factor 1 + e only moves the person along the optical
@@ -6,10 +6,10 @@ axis.
 
     z ~ f    =>    C = S + (s z)^2 e_z e_z'            e_z: the depth of the root
 
-S is the covariance of a mode at depth z for the assumed focal length, s the relative standard
-deviation of the focal length. The error is the same in all images, and more images do not reduce
-it: it is added to published covariances and enters no estimate (a consider covariance,
-[Schmidt 1966]).
+S is the covariance of a mode at depth z for the assumed focal length, and s is the relative
+standard deviation of the focal length. The error is the same in all images, so that more images do
+not reduce it. It is therefore added to published covariances, but does not enter any estimate (a
+consider covariance, [Schmidt 1966]).
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.camera_file import camera_of_view
 
-# Field of view of a common camera along the longer side of its images, degrees, and relative
-# standard deviation of the focal lengths of common cameras, which corresponds to 51 to 72 degrees.
+# Field of view of common cameras along the longer side of the image, degrees, and relative standard
+# deviation of their focal lengths, which corresponds to fields of view of 51 to 72 degrees.
 USUAL_FOV, USUAL_SIGMA = 60.0, 0.2
 
 
@@ -35,7 +35,7 @@ def usual_camera(size: tuple[int, int], fov: float = USUAL_FOV) -> Camera:
 
 
 def depth_covariances(poses: Array, sigma: float) -> Array:
-    """Return covariances (K, d, d) of poses (K, d) due to the focal length, see the module."""
+    """Return the covariances (K, d, d) of poses (K, d) due to the error of the focal length."""
     depth = np.arange(poses.shape[1]) == 2
     return np.multiply.outer((sigma * poses[:, 2]) ** 2, np.diag(depth).astype(np.float64))
 

@@ -1,6 +1,6 @@
 """Reports of sessions: the outcome of each message, and counts over all messages.
 
-The kind of a fault or a remark is a word or two that names it in the diagnostics.
+Every fault or remark has a kind, which is a short name for the diagnostics.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Output:
     Attributes:
         topic: a topic that the node publishes.
         stamp_ns: stamp of the message, ns.
-        message: the message; receivers must not change it.
+        message: message object, which receivers must not change.
     """
 
     topic: str
@@ -78,9 +78,9 @@ class HandlingLog:
         counts: numbers of messages that trigger estimates, by outcome: 'received', 'skipped',
             'dropped', and keys of the session.
         faults: number of faults by kind.
-        last_fault: newest fault; '' before the first.
+        last_fault: message about the newest fault; '' before the first fault.
         held_up: input that the last dropped message waited for; '' if the node was only late.
-        prefix: prefix of all texts; names the person concerned if there are several.
+        prefix: prefix of all messages, which names the person if several people are tracked.
     """
 
     def __init__(self) -> None:
@@ -111,7 +111,7 @@ class HandlingLog:
             self._warned.append(self.last_fault)
 
     def add_event(self, text: str) -> None:
-        """Logs an event that is no fault."""
+        """Logs an event that is not a fault."""
         self._events.append(one_line(f'{self.prefix}{text}'))
 
     def skip(self, kind: str, text: str) -> None:
@@ -171,7 +171,7 @@ def handled_message(messages: MessageFactory, handled: Handled) -> Any:
 
 
 def handled_of(message: Any) -> Handled:
-    """Return the content of an hmt_msgs/Handled of `rosbags` or of ROS."""
+    """Return the content of an hmt_msgs/Handled message, from `rosbags` or from ROS."""
     published = zip(message.published_topics, message.published_stamps, strict=True)
     return Handled(
         source=str(message.source),

@@ -1,4 +1,4 @@
-"""Parameters of the node that speaks REP 155."""
+"""Parameters of the node for REP 155."""
 
 from __future__ import annotations
 
@@ -58,5 +58,5 @@ class HriParameters(NodeParameters):
 
     @property
     def named(self) -> tuple[str, ...]:
-        """The namespaces, each once."""
+        """The namespaces without duplicates."""
         return tuple(dict.fromkeys(self.namespaces.split()))

@@ -4,15 +4,14 @@ The rules, in addition to those of `Session`:
 
 - Each track of a person is a body. Its identity consists of the name of the person (the namespace
   without /humans/bodies/) and the number of the track: p1_2 is the second track in
-  /humans/bodies/p1. If a new track finds a person again, this is a new body; no identity is used
-  twice.
+  /humans/bodies/p1. A new track of the same person is a new body; no identity is used twice.
 - /humans/bodies/tracked lists the bodies that are tracked. A body whose track is lost is not in the
   list until the same track is found again. A body ends with its track, with a mixture without
   components, or `MAX_SILENCE` after its last mixture.
-- A body is shown in one pose, its heaviest mode. Until that mode ends, another mode replaces it
-  only with more than twice its weight.
-- Regions, landmarks and cropped images need the calibrated camera_info of the frame of the mixture;
-  frames and joint states do not. A cropped image needs the image of the stamp of the mixture.
+- A body is shown in one pose, its heaviest mode. This mode is shown until it ends, or until another
+  mode has more than twice its weight.
+- Regions, landmarks and cropped images need a calibrated camera_info for the frame of the mixture;
+  frames and joint states do not. A cropped image also needs the image with the mixture's stamp.
 """
 
 from __future__ import annotations
@@ -75,7 +74,7 @@ _MIN_RELATIVE_WEIGHT = 0.5
 _MAX_ORIGIN_CHANGE = 0.005
 # Time without a mixture after which a body ends, by the stamps of camera_info, s.
 MAX_SILENCE = 2.0
-# Maximum number of people without a body whose last body number is remembered.
+# Maximum number of absent people whose last body number is remembered.
 _MAX_REMEMBERED_PEOPLE = 1000
 # Number of images kept for cropping; a filter with a larger delay drops images itself.
 _MAX_IMAGES = 20
@@ -105,11 +104,11 @@ class _Person:
         identity: identity of the body; '' without a body.
         tracked: whether the body is listed as tracked: it is neither lost nor ended.
         track: number of the body's track; 0: unnumbered.
-        bodies: number of the newest body, which its identity contains.
+        bodies: number of the person's newest body, which is part of the body's identity.
         heard: time of the last mixture, by the stamps of camera_info, ns.
         mode: identity of the mode that is shown; 0: none.
         angles: angles of the reference model in the previous image.
-        described: joints of the model whose URDF was published last.
+        described: joints in the last published URDF.
     """
 
     name: str
@@ -178,7 +177,7 @@ class HriSession(Session[HriParameters, HriState]):
 
     @property
     def identities(self) -> set[str]:
-        """Identities of the bodies that have topics: tracked ones, and lost ones until they end."""
+        """Identities of the bodies with topics: tracked bodies, and lost bodies until they end."""
         return {person.identity for person in self._people.values() if person.identity}
 
     def needed_inputs(self) -> list[NeededInput]:
@@ -273,7 +272,7 @@ class HriSession(Session[HriParameters, HriState]):
         return tuple(sorted(p.identity for p in self._people.values() if p.tracked))
 
     def _show(self, person: _Person, content: PoseMixture) -> None:
-        """Publishes a body in its pose.
+        """Publishes the pose of a body.
 
         Raises:
             ValueError: the joint positions are impossible for a person.
@@ -328,7 +327,7 @@ class HriSession(Session[HriParameters, HriState]):
         shown: int,
         camera: Camera,
     ) -> None:
-        """Publishes the messages that need a calibration; none for a body outside of the image."""
+        """Publishes the messages that need a calibration, unless the body is outside the image."""
         identity, stamp, frame = person.identity, content.stamp_ns, content.frame_id
         places, weights = content.joint_positions, content.weights
         region = region_in_image(camera, places[shown])
@@ -380,7 +379,7 @@ def _name_in(namespace: str) -> str:
 
 
 def _shown_mode(content: PoseMixture, before: int) -> int:
-    """Return the index of the mode to show; `before` is the identity of the last one, or 0."""
+    """Return the index of the mode to show; `before` is the identity of the last mode, or 0."""
     assert content.identities is not None
     heaviest = int(np.argmax(content.weights))
     for k in np.flatnonzero(content.identities == before) if before else ():

@@ -1,4 +1,4 @@
-"""Evidence of an image, and the chain of the filter's modes, from a likelihood mixture."""
+"""Evidence of an image, and links to the previous modes, read from a likelihood mixture."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from msg_tools import MessageError
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture
 
-# Maximum mean speed of the joints relative to the pelvis, m/s, and additional distance of modes of
-# two images, m; together they limit which modes a mode of unknown ancestry may continue.
+# Maximum mean speed of the joints relative to the pelvis, m/s, and distance that is allowed in
+# addition, m. Both limit which previous modes a mode of unknown ancestry may continue.
 MAX_SPEED, MODE_JITTER = 2.0, 0.05
 
 
@@ -27,7 +27,7 @@ class Evidence(NamedTuple):
 
     Attributes:
         modes: mixture of the evidence, with the weights and the ancestry of the filter's modes.
-        shape: (d, d) covariance of the errors shared by poses of all images; None: unknown.
+        shape: (d, d) covariance of the errors that are the same in all images; None: unknown.
         identities: (K,) identities of the modes in the filter; 0: none.
     """
 
@@ -49,7 +49,7 @@ class KeptMixtures(NamedTuple):
 
 
 def evidence_of(content: PoseMixture) -> Evidence:
-    """Return the evidence in a mixture; without an error model, errors count as independent.
+    """Return the evidence in a mixture; without an error model, errors are independent.
 
     If the posterior weights of the modes are not given, the weights of the mixture replace them.
     The modes have no ancestry yet, see `continued`.
@@ -90,7 +90,7 @@ def continued(
         before: evidence of the previous image.
         points, points_before: (K, P, 3) and (M, P, 3) points of the modes of both images, m. They
             are used if the ancestry is unknown or refers to an image that was not received: a mode
-            then continues all modes within reach.
+            then continues all previous modes within reach.
     """
     modes, others = evidence.modes, before.modes
     ancestry, known = content.ancestry, content.ancestry_stamp_ns == others.stamp_ns

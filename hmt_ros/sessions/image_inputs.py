@@ -1,13 +1,14 @@
-"""Table of the inputs that accompany camera images, and storage of those that wait for an image.
+"""Table of the inputs that accompany camera images, and their storage until the images arrive.
 
-`INPUTS` is the table of topics, types, readers, the parameters that make images wait for an input,
-and reports of missing inputs. Sessions, nodes, replay and recording use it. A new input needs a row
-here, a parameter that enables it, and code that uses its content.
+Each row of the table `INPUTS` gives an input's topics, message types and reader, the parameter that
+makes images wait for the input, and whether a missing input is reported. Sessions, nodes, replay
+and recording use the table. A new input needs a row, a parameter that enables it, and code that
+uses its content.
 
-An input belongs to the image of exactly its stamp; if several have the same stamp, the last is
-used. If the parameter of an input is true, an image waits for the input of its stamp, for an input
-of a later stamp, or for an image that is `input_timeout` younger. An unusable input is treated as
-an empty one.
+An input belongs to the image with exactly the same stamp; of several inputs with one stamp, the
+last is used. If the parameter of an input is true, an image waits for the input with its stamp, for
+an input with a later stamp, or for an image that is `input_timeout` younger. An unusable input is
+treated as an empty input.
 """
 
 from __future__ import annotations
@@ -57,17 +58,17 @@ class ImageInput:
     Attributes:
         name: name of the input.
         types: message types of the input, by source; the source is also the name of the topic.
-        parameter: name of the parameter that makes images wait for the input; '': they always wait.
+        parameter: name of the parameter that makes images wait for the input; '': always.
         read: function of a message and its stamp that returns the content, or None if it is empty;
             raises a one-line ValueError if the message can not be used.
         report_missing: whether an image without the input, and an input without an image, are
             reported.
-        pixels: end of the error text if input and image differ in size, with a remedy or '';
-            None: the input has no pixels.
+        pixels: remedy, or '', for the error message if input and image differ in size; None: the
+            input has no pixels.
         remembered: maximum number of inputs that wait for their image.
         largest: maximum size of a message, bytes.
         reliable: whether the subscription is reliable, so that no message is lost in transit.
-        together: whether inputs of earlier images are kept and used with the next image.
+        together: whether inputs of earlier images are used with the next image instead of dropped.
     """
 
     name: str
@@ -158,9 +159,9 @@ INPUTS = (MASK_INPUT, KEYPOINTS_INPUT, KEYPOINTS_3D_INPUT, DEPTH_INPUT, PREDICTI
 
 
 class StampedInputs(Generic[T]):
-    """Inputs that wait for the image of exactly their stamp; a later one replaces an earlier one.
+    """Inputs that wait for the image with their stamp; of inputs with one stamp, the last is kept.
 
-    None represents an input without content, for example of a detector that saw nobody.
+    None represents an input without content, for example if a detector saw nobody.
     """
 
     def __init__(self, most: int = MAX_SMALL_INPUTS) -> None:
@@ -180,9 +181,9 @@ class StampedInputs(Generic[T]):
             del self._content[next(iter(self._content))]
 
     def is_settled(self, stamp_ns: int, within_ns: float) -> bool:
-        """Whether the input for an image has come, or one that is later by at most `within_ns`.
+        """Whether the input for an image, or an input at most `within_ns` later, has arrived.
 
-        A much later input does not show that the input of the image is missing.
+        A much later input is no evidence that the input for the image is missing.
         """
         return any(0 <= each - stamp_ns <= within_ns for each in self._content)
 
@@ -207,7 +208,7 @@ class ImageInputs:
         return self._waiting[name]
 
     def row(self, source: str) -> ImageInput | None:
-        """Return the input that a source belongs to; None if the source is no input."""
+        """Return the input that a source belongs to; None if the source is not an input."""
         return self._rows.get(source)
 
     def put(self, source: str, message: Any, stamp_ns: int, read: Callable[..., Any]) -> None:
@@ -231,7 +232,7 @@ class ImageInputs:
             dropped: stamps of dropped images; their inputs are not reported.
 
         Returns:
-            Content for the image; None if there is no message, or if its content is empty.
+            Content for the image; None if the message is missing, empty, or of the wrong size.
         """
         taken = self._waiting[row.name].take_all(stamp_ns)
         content = taken.get(stamp_ns)

@@ -1,7 +1,7 @@
 """Keypoints of the person who is tracked, from messages of any detector.
 
 The parameter `source` selects the type of messages: hmt_msgs/Keypoints2D of one person, or messages
-of other detectors on one person or several:
+of other detectors about one or several people:
 
 - Skeleton2D is in units of the image size and needs an earlier camera_info. Its topic belongs to
   one person. Float32MultiArray without a stamp gets the stamp of the newest camera_info.
@@ -48,7 +48,7 @@ SKELETON = 'skeleton2d'
 MAX_ABSENCE = 1.0
 # Maximum motion of a person between two images, relative to the size of the person.
 _MAX_MOTION = 1.0
-# Decay factor per image of the remembered size of a person, who may be partly hidden.
+# Decay factor, per image, of a person's remembered size; the person may be partly hidden.
 _SIZE_DECAY = 0.95
 
 
@@ -56,14 +56,14 @@ def known_lifter(model: str) -> Lifter | None:
     """Load the lifter that the parameter `lifter` names; None if the name is empty.
 
     Raises:
-        ValueError: the file does not exist, or is not a lifter; one line.
+        ValueError: the file does not exist, or is not a lifter (one-line message).
     """
     with named_file('lifter', model, 'lifter'):
         return load_lifter(model) if model else None
 
 
 def keypoints_input(source: str) -> ImageInput:
-    """Return the input of keypoints for a value of `source`."""
+    """Return the keypoint input for a value of `source`."""
     if source == OWN_SOURCE:
         return KEYPOINTS_INPUT
     return replace(KEYPOINTS_INPUT, types={DETECTIONS: SOURCES[source]})
@@ -79,7 +79,7 @@ def _person_of_skeleton(
     return [person_of_skeleton(message, camera.width, camera.height)]
 
 
-# Readers of the people in a message, by the parameter `source`.
+# Functions that read the people in a message, by value of `source`.
 _READERS: dict[str, Callable[[Any, Scheme, Camera | None], list[DetectedPerson]]] = {
     'people': lambda message, _order, _camera: people_of_message(message),
     'boxes': lambda message, _order, _camera: people_of_boxes(message),
@@ -111,7 +111,7 @@ class ChosenPerson:
         """Choose the person among the people who were seen in an image.
 
         Args:
-            longest_absence: time after which the largest person is chosen again, s.
+            longest_absence: time without the person after which the largest person is chosen, s.
 
         Returns:
             The keypoints of the person; None if the person is not in the image.
@@ -139,7 +139,7 @@ def _size(keypoints: Keypoints) -> float:
 
 
 def _distance(one: Keypoints, other: Keypoints) -> float:
-    """Return the median distance of shared landmarks or, without any, of the centres, px."""
+    """Return the median distance of shared landmarks or, if none is shared, of the centres, px."""
     both = one.seen & other.seen
     if both.any():
         return float(np.median(elementary.hypot(*(one.pixels - other.pixels)[both].T)))
@@ -188,7 +188,7 @@ class KeypointReader(DetectionReader):
     """Reads the keypoints of the person who is tracked.
 
     Attributes:
-        chosen: the choice among several people.
+        chosen: selects the tracked person if a detector reports several people.
     """
 
     def __init__(self, source: str, log: HandlingLog) -> None:
@@ -209,7 +209,7 @@ class KeypointReader(DetectionReader):
             camera: camera of the image; None: not known yet.
 
         Raises:
-            ValueError: the message can not be used; one line.
+            ValueError: the message can not be used (one-line message).
         """
         found = self._found(message, stamp, parameters, camera)
         if found is None or not found.names:
@@ -252,8 +252,8 @@ class KeypointReader(DetectionReader):
         """Return the keypoints that were seen in an image, named as joints of the body.
 
         Args:
-            found: keypoints as read; None if no message has come.
-            positions: positions of the landmarks in space; None if no message has come.
+            found: keypoints from `read`; None without a message.
+            positions: positions of the landmarks in space; None without a message.
         """
         if found is None or not found.names:
             return found

@@ -1,9 +1,9 @@
 """Session of the keypoint detector: images in, keypoints of one person or several out.
 
-- With `people` above 0 every usable image gets one message on detections, with all people and their
-  identities, and no other message. Otherwise it gets one message on keypoints, one on keypoints_3d
-  and, with `publish_mask`, one on mask. Messages without names, and a mask of zeros, mean that
-  nobody was seen.
+- With `people` above 0 every usable image gets one message on the topic detections, with all people
+  and their identities. Otherwise every image gets one message on the topic keypoints, one on
+  keypoints_3d and, with `publish_mask`, one on mask. Messages without names, and a mask of zeros,
+  mean that nobody was seen.
 - All messages have the stamp and the frame of the image.
 - Unusable images are skipped. The first fault of each kind is logged; all are counted.
 """
@@ -80,7 +80,7 @@ class KeypointsParameters(ImageNodeParameters):
 class KeypointsState(SessionState):
     """State of the detection: its status is 'waiting', 'nobody' or 'detecting'.
 
-    Counts: 'detected' are all images that were searched, 'empty' the images without a person.
+    Keys of `counts`: 'detected' (searched images) and 'empty' (images without a person).
 
     Attributes:
         landmarks: number of landmarks of all people in the last image.
@@ -122,7 +122,7 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
 
     def restart(self) -> None:
         """See `Session`."""
-        # The detector itself recognises a new sequence, from the stamps.
+        # The detector itself recognises a new sequence by the stamps.
         self._landmarks: int | None = None
         self._count: int | None = None
         super().restart()

@@ -1,7 +1,7 @@
-"""Files that parameters name: their allowed folders, and errors that do not reveal content.
+"""Files that parameters name: allowed folders, and error messages that do not reveal content.
 
-A client that sets a parameter of a node over ROS may have no right to read files there. A public
-error has the path of the file and the kind of the fault, never its content.
+A client that sets parameters over ROS may not be allowed to read files on the node's machine.
+Public error messages give the path of the file and the kind of fault, never the file's content.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hmt_ros.body import model_names
 from hmt_ros.experts import lifter, pose_predictor
 from msg_tools.files.error_line import error_line, one_line
 
-# Parameters that may name a file, each with a function that returns the names that are not files.
+# Parameters that may name a file, each with a function that returns valid names other than files.
 FILE_PARAMETERS: Mapping[str, Callable[[], Collection[str]]] = {
     'subject_file': tuple,
     'background_file': tuple,
@@ -30,7 +30,7 @@ class NamedFileError(ValueError):
     """A parameter names a file that can not be used.
 
     Attributes:
-        public: parameter, path and kind of the fault; the text of the error may quote the file.
+        public: message that does not quote the file: parameter, path and kind of fault.
     """
 
     def __init__(self, text: str, public: str) -> None:
@@ -40,7 +40,7 @@ class NamedFileError(ValueError):
 
 @contextmanager
 def named_file(parameter: str, path: str, wanted: str) -> Iterator[None]:
-    """Turns any exception while the file of a parameter is read into a `NamedFileError`.
+    """Replaces any exception that occurs while reading a parameter's file by `NamedFileError`.
 
     Args:
         wanted: kind of the file, in words.
@@ -48,7 +48,7 @@ def named_file(parameter: str, path: str, wanted: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        # Readers may raise any exception on a file from outside.
+        # Readers may raise any exception if a file is malformed.
         text = error_line(error)
         if not isinstance(error, ValueError):
             text = f'{parameter} {path}: {text}'
@@ -61,7 +61,7 @@ def public_line(error: BaseException) -> str:
 
 
 def check_place(parameter: str, path: str, folders: Collection[str]) -> None:
-    """Checks that a parameter may name a file.
+    """Checks that a parameter is allowed to name a file.
 
     Args:
         folders: folders that may contain the file, after links are resolved.
@@ -89,7 +89,7 @@ def check_place(parameter: str, path: str, folders: Collection[str]) -> None:
 
 
 def _fault(error: BaseException | None, wanted: str) -> str:
-    """Return the kind of a fault, with the line number if a text is not YAML."""
+    """Return the kind of fault, with the line number of invalid YAML."""
     while error is not None:
         if (mark := getattr(error, 'problem_mark', None)) is not None:
             return f'not a {wanted}: line {mark.line + 1} is not YAML'

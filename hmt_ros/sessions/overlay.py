@@ -1,6 +1,6 @@
 """Overlay on an image: the modes of a mixture as skeletons, and notes for a user.
 
-Colours are those of the markers: the heaviest mode is orange, the others are blue, and modes of
+Colours match the markers: the heaviest mode is orange, the others are blue, and modes of
 less weight are fainter. The same modes on the same image give the same picture.
 """
 

@@ -1,4 +1,4 @@
-"""Parameter files of ROS 2, read without ROS; `docs/generate.py` writes those in `config`."""
+"""Reads parameter files of ROS 2 without ROS; `docs/generate.py` writes the files in `config`."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ def yaml_scalar(value: Value) -> str:
 
 
 def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -> dict[str, Any]:
-    """Read the parameters of a node from a file, by name, with dots between groups.
+    """Read the parameters of a node from a file, as a mapping from dotted name to value.
 
     Sections for other nodes are ignored; a file may also contain only parameters, without sections.
 
     Args:
-        by_name: whether to use only the sections that name the node, not those for all nodes.
+        by_name: whether to use only sections that name the node, without sections for all nodes.
 
     Raises:
-        ValueError: the file is not a parameter file; one line with the reason.
+        ValueError: the file is not a parameter file (one-line message with the reason).
     """
     path = Path(path)
     try:
@@ -55,7 +55,7 @@ def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -
     for key in document:
         if str(key) not in sections:
             raise ValueError(f'{path}: section {key!r} has no {PARAMETERS_KEY}')
-    # As in ROS, a section for one node overrides a section for all.
+    # As in ROS, a section for one node overrides a section for all nodes.
     for key in sorted(sections, key=lambda key: '*' not in key):
         if key.rpartition('/')[2] in ((node,) if by_name else (node, '*', '**')):
             result.update(_flattened(sections[key][PARAMETERS_KEY] or {}, '', path))

@@ -1,4 +1,4 @@
-"""The people in the messages of a detector, as joints of the body and positions in the image."""
+"""Reads people from the messages of a detector, as body joints and positions in the image."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Found:
     """A person in the detections of an image.
 
     Attributes:
-        detected: person as detected.
+        detected: person as read from the message.
         keypoints: seen keypoints, named as joints of the body.
         sighting: position of the person in the image.
     """
@@ -77,8 +77,8 @@ class PeopleReader(DetectionReader):
         """Return the people who are at least partly visible.
 
         Args:
-            use_keypoints: whether to return keypoints; otherwise they only give the extent of a
-                person.
+            use_keypoints: whether to return keypoints; otherwise keypoints only give the extent of
+                a person.
         """
         result = []
         for person in people:

@@ -11,7 +11,7 @@ The rules, in addition to those of `CameraSession`:
   only a farther person covers, are unknown (`Tracker.step`, others).
 - The background is learned while nobody is detected, or read from `background_file`.
 - For every image with known detections, a list of the tracked people is published, together with
-  markers and an overlay that show all of them.
+  markers and an overlay of all people.
 """
 
 from __future__ import annotations
@@ -81,13 +81,13 @@ def published_topic(topic: str) -> PublishedTopic:
 
 
 def session_of(parameters: FilterParameters) -> type[TrackingSession]:
-    """Return the class of the session that tracks with these parameters."""
+    """Return the session class for the parameters of one person or of several people."""
     return PeopleSession if isinstance(parameters, PeopleParameters) else TrackingSession
 
 
-# Minimum width and height in the image of a person whose track starts, px.
+# Minimum width and height of a detection that starts a track, px.
 MIN_SIZE = 4
-# Time without a detection after which a person without a track is dropped, s.
+# Time after which a person with neither a track nor a new detection is dropped, s.
 MAX_UNSTARTED_TIME = 0.5
 
 
@@ -122,7 +122,7 @@ class _Person(Track):
         stamp: stamp of the image of the first detection, ns.
 
     Attributes:
-        known_as: identity given by the detector; '' without one.
+        known_as: identity given by the detector; '' without an identity.
         place: track of the person's detections in the image.
     """
 
@@ -141,7 +141,7 @@ class _Person(Track):
         )
 
     def area(self, camera: Camera, shift: Array | None = None) -> Mask | None:
-        """Pixels (H, W) of the body in likely modes, shifted by (2,) px; None without a track."""
+        """Mask (H, W) of the body in its likely modes, shifted by (2,) px; None without a track."""
         if not self.begun or self.tracker is None:
             return None
         modes = self.tracker.estimate.modes
@@ -151,7 +151,7 @@ class _Person(Track):
         return grown(result if shift is None else moved(result, shift))
 
     def expected_area(self, camera: Camera, one: Found | None, stamp: int) -> Mask:
-        """Pixels (H, W) that the person is expected to cover.
+        """Mask (H, W) of the pixels that the person is expected to cover.
 
         Args:
             one: detection of the person in the image; None if the person was not detected.
@@ -277,7 +277,7 @@ class PeopleSession(TrackingSession):
         background: BackgroundModel,
         stamp: int,
     ) -> None:
-        """Starts tracks from the largest unmatched detections; moves them from `left` to `own`."""
+        """Starts tracks from the largest unmatched detections, and moves these to `own`."""
         p, size = self.parameters, (camera.width, camera.height)
         for one in sorted(left, key=lambda x: -x.sighting.size):
             corners = np.clip(np.rint(one.sighting.corners), 0, size).astype(int)

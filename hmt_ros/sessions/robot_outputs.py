@@ -1,8 +1,8 @@
-"""Outputs for robots: the pose of the person at a later time, and the space to keep out of.
+"""Outputs for robots: forecasts of the pose, and the space that a robot must keep out of.
 
 Both are computed from the last image that showed the person. While the track is lost or no image
-arrives, the space grows as fast as people move; only an image that shows that nobody is in view
-frees it. All times are from stamps, so that the same images give the same bytes.
+arrives, the space grows as fast as people move. It becomes free only when an image shows that
+nobody is in view. All times are based on stamps, so that the same images give the same bytes.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.keep_out import KeepOut, KeepOutState
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, TrackState
 
-# Maximum time from the newest image to a forecast, s: later a person may be anywhere.
+# Maximum time from the newest image to a forecast, s, as the person may be anywhere afterwards.
 MAX_FORECAST_TIME = 10.0
-# Maximum number of forecasts per image: after a gap the earliest are of no use.
+# Maximum number of forecasts per image; after a long gap the earliest forecasts are omitted.
 MAX_FORECASTS = 100
 
 
@@ -112,7 +112,7 @@ class RobotOutputs:
             stamp_ns, frame_id: stamp of the image, ns, and frame of the outputs.
             existence: probability that a person is in view; NaN: unknown.
             seen: state of the track, if the image shows the person; None: the last state is kept.
-            reason: reason of the state, see `KeepOut`.
+            reason: reason for the state, see `KeepOut`.
         """
         before = self._told.seen
         if state is KeepOutState.NOBODY:
@@ -125,10 +125,10 @@ class RobotOutputs:
         )
 
     def keep_out(self, probability: float, silence: float | None = None) -> KeepOut:
-        """Return the space to keep out of.
+        """Return the space that robots must keep out of.
 
         Args:
-            probability: requested probability; reported if there are no capsules.
+            probability: probability that is reported if there are no capsules.
             silence: time since the outputs for the newest image were published, s; None: they are
                 published now.
         """
@@ -193,10 +193,10 @@ class RobotOutputs:
         )
 
     def due(self, rate: float, horizon: float) -> Iterable[int]:
-        """Return the grid times, ns, that have newly come within the horizon of the newest image.
+        """Return the forecast times, ns, that have come within the horizon since the last call.
 
         Args:
-            rate: number of grid times per second; 0: no grid times.
+            rate: number of forecast times per second; 0: no forecasts.
             horizon: maximum time from an image to a forecast, s.
         """
         told = self._told

@@ -1,4 +1,4 @@
-"""Evidence of the newest images, kept for a smoother in the process of the filter."""
+"""Evidence of the newest images, kept for a smoother in the same process as the filter."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 
 from hmt_ros.image.image_sequence import SeenImage
 
-# Maximum memory of the images of a window, MB; 47 images of 640 x 480 pixels that the person fills
-# take 80 MB.
+# Maximum memory of the images of a window, MB; 47 images of 640 x 480 pixels take 80 MB if the
+# person fills them.
 MAX_MEGABYTES = 256
 
 
@@ -32,9 +32,9 @@ class SeenImages:
         self._lock = threading.Lock()
 
     def add(self, stamp_ns: int, image: SeenImage | None) -> None:
-        """Keeps the evidence of an image; ignores None, which means that it shows nobody.
+        """Keeps the evidence of an image; ignores None, which stands for an image of nobody.
 
-        Kept images that are not older are from before a jump in time, and are dropped.
+        Drops kept images that are not older, because they precede a jump in time.
         """
         if image is None:
             return
@@ -56,7 +56,7 @@ class SeenImages:
             self._kept = kept
 
     def of(self, stamps_ns: Sequence[int]) -> list[SeenImage | None]:
-        """Return the images of some stamps; None for each that is not kept."""
+        """Return the image of each stamp, or None if the image is not kept."""
         kept = self._kept
         return [kept[stamp][0] if stamp in kept else None for stamp in stamps_ns]
 

@@ -1,10 +1,10 @@
-"""Base class of sessions, which hold the logic of a node: messages in, messages out, without ROS.
+"""Base class of sessions, with the logic of a node: messages in, messages out, without ROS.
 
 A node and an offline replay pass their messages to a session; the same messages in the same order
 give the same bytes. Messages that trigger estimates are used in the order of their stamps
-(`stamp_order`): a message that is far ahead of the previous ones, or older, waits until other
-messages confirm its time. If they confirm an older time, the estimate restarts. Messages that can
-not be used are skipped. The first fault of each kind is logged; all are counted.
+(`stamp_order`): a message that is older than the previous one, or far ahead of it, waits until
+other messages confirm its time. If an older time is confirmed, the estimate restarts. Messages that
+can not be used are skipped. The first fault of each kind is logged; all are counted.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from msg_tools import MessageError, RosbagsMessages
 from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.images import decode_image
 
-# Prefix of the diagnostics key for the number of subscribers of a topic.
+# Prefix of the diagnostics keys for the numbers of subscribers.
 SUBSCRIBERS_KEY = 'subscribers of '
 FINISH = 'finish'  # source of the report of `finish`, at the end of the stream
 TIME_JUMP = 'time jumps back'  # kind of fault
@@ -67,16 +67,16 @@ class SessionState(ABC):
     """State of a session, for diagnostics.
 
     Attributes:
-        status: one of the words that the state class of the session lists.
-        wants: input that the next step waits for; '' while it works.
+        status: one of the words in the docstring of the session's state class.
+        wants: input that the session waits for; '' if it waits for none.
         entropy: entropy of the weights of the present mixture, nats; NaN without a mixture.
         counts: numbers of messages that trigger estimates, by outcome: 'received', 'skipped',
             'dropped', and keys of the session.
         faults: number of faults by kind.
-        last_fault: newest fault; '' before the first.
+        last_fault: message about the newest fault; '' before the first fault.
         held_up: input that the last dropped message waited for; '' if the node was only late.
-        frame_id: frame of the newest message that triggers an estimate; '' before the first.
-        time_jump: report on the last step back of the clock; '' before the first.
+        frame_id: frame of the newest message that triggered an estimate; '' without a frame.
+        time_jump: message about the last backward jump of the clock; '' before the first jump.
     """
 
     status: str
@@ -133,7 +133,7 @@ class Session(ABC, Generic[Parameters, State]):
         wanted: function that returns whether a topic needs to be published.
 
     Raises:
-        ValueError: the parameters name something that can not be used.
+        ValueError: a value of the parameters can not be used.
 
     Attributes:
         TOPICS: the topics that are published.
@@ -147,7 +147,7 @@ class Session(ABC, Generic[Parameters, State]):
         interrupted: function, set by a node, that returns whether messages have arrived during an
             estimate.
         state: present state; replaced with every message.
-        topic_names: full names of the topics by source, for texts of faults; empty without topics.
+        topic_names: full topic names by source, for error messages; empty without topics.
         decode_image: function that decodes the image of a message; nodes of a process share it.
         publishing: time spent on serialising and publishing messages, s; for diagnostics.
     """
@@ -197,9 +197,9 @@ class Session(ABC, Generic[Parameters, State]):
         """Handles a message.
 
         Args:
-            source: source of the message, as named in the module of the session.
+            source: name of the source, as defined in the module of the session.
             message: message of `rosbags` or of ROS.
-            more: whether another message is waiting already; work is then postponed if possible.
+            more: whether another message is waiting; estimates are then postponed if possible.
         """
         try:
             stamp = self._stamp_of(source, message)
@@ -228,7 +228,7 @@ class Session(ABC, Generic[Parameters, State]):
         self.state = self._present_state()
 
     def finish(self) -> Handled:
-        """Uses the waiting messages, as no others will arrive."""
+        """Uses the waiting messages, as no more messages will arrive."""
         self._log.begin()
         for source, order in self._orders.items():
             self._use(source, order.end())
@@ -308,7 +308,7 @@ class Session(ABC, Generic[Parameters, State]):
         }
 
     def _on_topic(self, source: str) -> str:
-        """Return the name of a source with its topic, for faults."""
+        """Return the name of a source with its topic, for error messages."""
         topic = self.topic_names.get(source)
         return f'{source} on {topic}' if topic else source
 
@@ -366,7 +366,7 @@ class Session(ABC, Generic[Parameters, State]):
 
 
 def frame_id_of(message: Any) -> str:
-    """Return the frame that a message names; '' if it names none."""
+    """Return the frame that a message names; '' without a frame."""
     header = getattr(message, 'header', None)
     return '' if header is None else str(header.frame_id)
 

@@ -44,7 +44,7 @@ class SmoothedBody:
     """The person whose poses are smoothed.
 
     Attributes:
-        body: body with its present lengths.
+        body: body with the present segment lengths.
         frame_id: frame of the poses.
         track_id: number of the track of the filter; 0: unknown.
     """
@@ -55,12 +55,12 @@ class SmoothedBody:
 
 
 class OpenPose(NamedTuple):
-    """Fields of a mixture of the filter that are published with its smoothed pose.
+    """Fields of a filter's mixture that are published with the smoothed pose.
 
     Attributes:
         state: state of the track in the filter.
         existence: probability, from the filter, that a person is in view; NaN: unknown.
-        shape: (d, d) covariance of the errors shared by poses of all images; None: unknown.
+        shape: (d, d) covariance of the errors that are the same in all images; None: unknown.
     """
 
     state: TrackState
@@ -71,12 +71,12 @@ class OpenPose(NamedTuple):
 def trajectory_content(
     found: TrajectoryMixture, of: SmoothedBody, *, covariances: bool, shapes: Mapping[int, Array]
 ) -> TrajectoryContent:
-    """Return the content of a message on a mixture over trajectories.
+    """Return the content of a message with a mixture over trajectories.
 
     Args:
         found: trajectories, with stamps.
-        covariances: whether the message has covariances.
-        shapes: covariances (d, d), by stamp, of errors shared by poses of all images; they are
+        covariances: whether the message contains covariances.
+        shapes: covariances (d, d), by stamp, of errors that are the same in all images; they are
             added to the covariances of the poses.
     """
     content = found.message_content(covariances=covariances)
@@ -134,10 +134,10 @@ def final_messages(
     """Yields topics and messages of a pose that will not be revised.
 
     Args:
-        frame_prefix: prefix of the names of the links on /tf; None: no transforms.
+        frame_prefix: prefix of link names on /tf; None: transforms are not published.
 
     Raises:
-        MessageError: the mixture is invalid in a message.
+        MessageError: the mixture is not valid in a message.
     """
     shows_links = frame_prefix is not None and wanted('/tf')
     if not (wanted('smoothed_pose_mixture') or wanted('smoothed_joint_states') or shows_links):
@@ -201,7 +201,7 @@ def nobody_messages(
 
 
 def _markers(of: SmoothedBody, joints: Array, weights: Array, stamp_ns: int) -> Any:
-    """Return a MarkerArray of joint positions (M, T, J, 3); it removes markers of other ranks."""
+    """Return markers of joint positions (M, T, J, 3); they replace all earlier markers."""
     names = of.body.joint_names
     edges = [(names[a], names[b]) for a, b in of.body.skeleton.bones]
     return trajectory_markers(

@@ -1,4 +1,4 @@
-"""Parameters of the smoother node, which are the settings of offline replay as well."""
+"""Parameters of the smoother node and of its offline replay."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hmt_ros.sessions.declared_parameters import (
     parameter_field,
 )
 
-# When motions are refined on images.
+# Values of `refine_on_images`: when motions are refined on images.
 NEVER, ASKED, AT_END = REFINEMENTS = ('never', 'asked', 'end')
 
 

@@ -3,24 +3,24 @@
 The rules, in addition to those of `Session`:
 
 - Mixtures are smoothed in the order of their stamps, in a sliding window. As neighbouring results
-  hardly differ, this is done at most every 0.1 s, or every fifth of `fixed_lag` if that is shorter.
-  A smoothed pose is published while it is at most 1.2 times `fixed_lag` older than the newest one.
-  When a window ends, its unpublished poses are published: at the end of the stream (`finish`), when
-  time jumps back, and at a new body.
+  hardly differ, the interval between two smoothings is at least 0.1 s or, if shorter, a fifth of
+  `fixed_lag`. A smoothed pose is published with a delay of at most 1.2 times `fixed_lag`. A window
+  ends at the end of the stream (`finish`), when time jumps back, and at a new body; its
+  unpublished poses are then published.
 - A mixture names its body and carries the segment lengths of the person; without them the lengths
   of the model apply. Another body, a jump of the lengths, another frame or another track_id means
-  a new track and starts a new window. Slow changes of the lengths refine their estimate.
+  a new track and starts a new window. Slow changes of the lengths are accepted as better estimates.
 - A likelihood without components means that nobody is in view: the window ends, and a smoothed
   mixture without components is published, with markers that remove the earlier ones.
 - Likelihoods carry the chain of the filter's modes (`posterior_weight`, `ancestry`), which alone
-  determines the weights of motions. Without it, a mode may continue every mode within reach.
+  determines the weights of motions. Without the chain, a mode may continue every mode within reach.
 - Errors of consecutive images are correlated, according to the error model of the likelihood and
   the time between the images (`error_model`). A likelihood without an error model is skipped; so is
   a forecast, because it contains no evidence.
 - The uncertainty of the person's shape is the same in all images. It is added once, to the
   covariances that are published.
 - Near the limits of the root's angles, for example with a camera on its side, mixtures are smoothed
-  in the frame of a camera that is rotated by quarter turns; this begins a new window.
+  in a camera frame that is rotated by quarter turns; this begins a new window.
 - Cyclic angles are unwrapped from mixture to mixture, each mode relative to the nearest previous
   mode, because the dynamics would treat a whole turn as a jump.
 - The dynamics bridge gaps. Gaps longer than `MAX_INTERVAL` are reported.
@@ -73,7 +73,7 @@ MIXTURE, TRAJECTORIES = 'likelihood_mixture', 'trajectory_mixture'
 NOBODY_STATUS = 'nobody'  # status while nobody is in view
 # Maximum change of a segment length between two mixtures of the same person, m.
 LENGTH_TOLERANCE = 0.02
-# Minimum time between two smoothings: SHARE_OF_LAG times the lag, but at most RARELY, s.
+# Minimum time between two smoothings, as a fraction of the lag, and upper bound of this time, s.
 INTERVAL_OF_LAG, MAX_MIN_INTERVAL = 0.2, 0.1
 # Maximum interval between two mixtures that is not reported as a gap, s.
 MAX_INTERVAL = 0.25
@@ -90,7 +90,7 @@ class SmootherState(SessionState):
         window: number of poses in the window.
         trajectories: number of components of the mixture over trajectories.
         gaps: number of intervals between mixtures that were longer than `MAX_INTERVAL`.
-        longest_gap: longest of these intervals, s.
+        longest_gap: longest interval between mixtures that counts as a gap, s.
     """
 
     window: int = 0
@@ -118,7 +118,7 @@ class SmootherState(SessionState):
 
 
 def ignore_event(text: str) -> None:
-    """Ignores a report."""
+    """Ignores a log message."""
 
 
 class SmootherSession(Session[SmootherParameters, SmootherState]):
@@ -279,7 +279,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         """Return the person of a mixture; it is the same object while the person does not change.
 
         Raises:
-            MessageError: the body is unknown, or not the one that the parameters name.
+            MessageError: the body is unknown, or differs from the body that the parameters name.
         """
         about = (
             content.body_model,
@@ -292,7 +292,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             return self._resolved[1]
         chosen = self.parameters.body_model
         try:
-            # A message must not cause files to be read: its body must ship with the package.
+            # A message must not cause files to be read: the named body must ship with the package.
             model = _chosen_body(chosen) if chosen else named_body(content.body_model)
         except (OSError, ValueError) as error:
             raise MessageError(public_line(error), 'body') from error
@@ -342,7 +342,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     def _end_window(self) -> None:
         """Publishes the poses that are still open, and forgets the window."""
         if self._window is not None and self._of is not None:
-            # The track may continue in the next window, whose identities must differ.
+            # The track may continue in the next window, where identities must not be used again.
             self._first_identity = self._window.next_identity
             for pose in self._window.finish():
                 self._publish_final(pose, self._of)
@@ -371,8 +371,8 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         Args:
             from_ns, to_ns: first and last stamp, inclusive, ns; 0 selects the oldest and the newest
                 mixture.
-            notify: function that is called with a line that says whether images refined the
-                motions, or why they did not.
+            notify: function that receives a line about whether images refined the motions or, if
+                not, about the reason.
 
         Returns:
             hmt_msgs/TrajectoryMixture with covariances.
@@ -388,7 +388,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     def smoothed_span(
         self, from_ns: int = 0, to_ns: int = 0, notify: Callable[[str], None] = ignore_event
     ) -> tuple[TrajectoryMixture, SmoothedBody]:
-        """Return the trajectories of a span of time, and their person; see `smooth_span`."""
+        """Return the trajectories of a span of time, and the person; see `smooth_span`."""
         of, items = self.kept
         chosen = [
             item.modes
@@ -444,7 +444,7 @@ def _chosen_body(model: str) -> Body:
 
 
 def _levelled(evidence: Evidence, body: Body) -> Evidence:
-    """Convert evidence from root angles relative to the camera to those of a levelled body."""
+    """Convert the root angles of evidence from the camera frame to the frame of a levelled body."""
     camera = body.levelled(np.eye(3))
     if camera is body:
         return evidence
@@ -457,7 +457,7 @@ def _levelled(evidence: Evidence, body: Body) -> Evidence:
 
 
 def _shapes(items: Iterable[tuple[int, Array | None]]) -> dict[int, Array]:
-    """Return the covariances of shape errors that are known, by stamp."""
+    """Return the known covariances of shape errors, by stamp."""
     return {stamp: shape for stamp, shape in items if shape is not None}
 
 

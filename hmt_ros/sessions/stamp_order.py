@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 from msg_tools.messages.headers import SECOND_NS
 
-# Number of messages in a row that confirm another time, and minimum step back of a clock, ns: a
-# stream soon catches up with a shorter step. EXPECTED is used if the clock may go back.
+# Number of consecutive messages that confirm a jump in time, and minimum backward jump, ns, as a
+# stream soon catches up after a shorter jump. EXPECTED_JUMP applies if backward jumps are expected.
 CONFIRMING_MESSAGES, EXPECTED_JUMP = (3, SECOND_NS), (2, 0)
-# Maximum step ahead without confirmation by other messages, ns, and in intervals of the stream; the
-# larger one applies.
+# Maximum forward step without confirmation by other messages, in ns and in message intervals of the
+# stream; the larger limit applies.
 _MIN_STEP_AHEAD_NS, _MIN_INTERVALS_AHEAD = SECOND_NS, 5
 
 
@@ -32,8 +32,8 @@ class Turn(NamedTuple):
     Attributes:
         use: messages to use now, in their order.
         stray: messages that were put aside and are not used.
-        late: whether the new message is skipped, as it is not newer than earlier ones.
-        back: time by which the clock went back before the first of `use`, ns; 0: it did not.
+        late: whether the new message is skipped, as it is not newer than earlier messages.
+        back: backward jump of the clock before the first message of `use`, ns; 0: no jump.
     """
 
     use: tuple[Stamped, ...] = ()
@@ -43,11 +43,11 @@ class Turn(NamedTuple):
 
 
 class StampOrder:
-    """The order of one stream.
+    """Orders the messages of one stream by their stamps.
 
     Attributes:
         newest: stamp of the newest message that could be used, ns, set by the caller; None before
-            the first.
+            the first message.
     """
 
     def __init__(self) -> None:
@@ -59,7 +59,7 @@ class StampOrder:
         """Adds the next message; returns the messages that can now be used.
 
         Args:
-            expected: whether the clock may go back, for example when a bag is played again.
+            expected: whether backward jumps are expected, for example when a bag is played again.
         """
         newest, aside = self.newest, self._aside
         agreeing, least_back = EXPECTED_JUMP if expected else CONFIRMING_MESSAGES
@@ -79,14 +79,14 @@ class StampOrder:
         return self._used(use, back=max(newest - use[0].stamp, 0))
 
     def end(self) -> Turn:
-        """Return the turn at the end of the stream: messages ahead are used, others are stray."""
+        """End the stream: messages ahead are used, older messages put aside are stray."""
         aside, self._aside = self._aside, ()
         if aside and self.newest is not None and aside[0].stamp > self.newest:
             return self._used(aside)
         return Turn(stray=aside)
 
     def _longest(self) -> float:
-        """Return the maximum interval to the next message that is not a jump, ns."""
+        """Return the maximum interval to the next message that is not considered a jump, ns."""
         interval = self._interval
         return (
             float('inf')

@@ -3,8 +3,8 @@
 If several people are tracked, each has topics in `humans/bodies/<id>/` (REP 155), and link frames
 that begin with `body_<id>/`; for a single person there are no such prefixes. When the person is no
 longer in view, one mixture of each kind without components is published, with markers that remove
-the earlier ones, and then nothing until a new track starts. Outputs for robots are published for
-every image.
+the earlier markers. Only outputs for robots, which are published for every image, follow until a
+new track starts.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Shared:
         answering: lock on the outputs for robots, so that the watchdog never publishes after the
             outputs for a newer image.
         answered: number of images for which outputs for robots were published.
-        seen_images: store of image evidence on a single person, camera frame, for a smoother.
+        seen_images: store of evidence for a smoother, if one person is tracked in the camera frame.
     """
 
     frames: CameraFrames
@@ -111,7 +111,7 @@ class Track:
         person: identity of the person, used in names of topics and frames; '' for a single person.
         parameters: parameters of the node; `follow` replaces them.
         background: background that several tracks share and that is learned elsewhere; None: the
-            track learns its own.
+            track learns its own background.
 
     Attributes:
         person: identity of the person.
@@ -147,12 +147,12 @@ class Track:
         self.tracker = None
         self.body: Body | None = None
         self.weights = np.empty(0)
-        # Angle by which the root is turned in the fixed frame, see `FixedFrame`.
+        # Attribute `turn` of the next `FixedFrame`, rad.
         self._turn = 0.0
 
     @property
     def track_id(self) -> int:
-        """Number of the present or last track; 0 before the first."""
+        """Number of the present or last track; 0 before the first track."""
         return self._last_id if self.tracker is None else self.tracker.track_id
 
     @property
@@ -261,7 +261,7 @@ class Track:
         self._shared.publish(topic_of(self.person, topic), stamp, message)
 
     def _fixed_frame(self) -> FixedFrame | None:
-        """Return the fixed frame to publish in; None if not requested or its pose is unknown."""
+        """Return the fixed frame of the messages; None if not requested, or its pose is unknown."""
         p, pose = self._parameters, self._shared.frames.pose
         if not p.publish_in_fixed_frame or pose is None:
             return None

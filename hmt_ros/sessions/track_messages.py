@@ -47,7 +47,7 @@ from msg_tools.messages.urdf import link_frames
 # Topics, in the order in which they are published.
 TOPICS = {
     'body': PublishedTopic('hmt_msgs/msg/Body', latched=True),
-    # Not robot_description, which without a namespace is the description of the robot itself.
+    # Not robot_description, which without a namespace describes the robot.
     'human_description': PublishedTopic('std_msgs/msg/String', latched=True),
     'pose_mixture': PublishedTopic('hmt_msgs/msg/PoseMixture'),
     'likelihood_mixture': PublishedTopic('hmt_msgs/msg/PoseMixture'),
@@ -78,11 +78,11 @@ class TrackedImage:
     """An image, the track in it, and settings of its messages.
 
     Attributes:
-        waiting: the image.
+        waiting: image with its stamp and frame.
         tracker: the tracker, updated from the image.
         posterior, likelihood: mixtures over poses, heaviest first.
         parameters: parameters of the node.
-        frame_prefix: prefix of the names of the links.
+        frame_prefix: prefix of the link names.
         starts: whether the body is new, or its lengths have changed since it was published.
         describe: whether to publish the URDF, because the body or the names of its frames are new.
         fixed: frame of mixtures, markers and the pose of the person; None: the frame of the camera.
@@ -103,7 +103,7 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
     """Yields topics and messages of a tracked image, in the order of `TOPICS`.
 
     Raises:
-        MessageError: a mixture is invalid in a message.
+        MessageError: a mixture is not valid in a message.
     """
     stamp, frame = track.waiting.stamp_ns, track.waiting.frame_id
     tracker, p = track.tracker, track.parameters
@@ -112,7 +112,7 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
     skeleton = body.skeleton
     joints = forward(tracker.estimate.body.skeleton, posterior.means).joints().transpose(2, 0, 1)
     ground = _ground_state(track)
-    # Both are made before anything is published, as either may turn out to be invalid.
+    # Both mixtures are made before anything is published, as either may turn out to be invalid.
     made = {
         'pose_mixture': lambda: _posterior(track, joints),
         'likelihood_mixture': lambda: _likelihood(track),
@@ -166,7 +166,7 @@ def track_messages(track: TrackedImage, wanted: Callable[[str], bool]) -> Iterat
 def nobody_messages(
     tracker: Tracker, waiting: WaitingImage, p: FilterParameters, wanted: Callable[[str], bool]
 ) -> Iterator[tuple[str, Any]]:
-    """Yields topics and messages of an image that ends a track, as nobody is or was in view.
+    """Yields topics and messages at the end of a track, when nobody is, or ever was, in view.
 
     The overlay shows the image without modes and states the reason; all markers are removed.
     """

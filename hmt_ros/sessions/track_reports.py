@@ -17,7 +17,7 @@ _SAME_MOMENT_NS = SECOND_NS // 5
 
 
 class TrackCondition(NamedTuple):
-    """State of a track that is compared from image to image.
+    """State of a track, compared between images to report changes.
 
     Attributes:
         status: status of the tracker.
@@ -38,7 +38,7 @@ class TrackCondition(NamedTuple):
 
     @classmethod
     def of(cls, tracker: Tracker | None) -> TrackCondition:
-        """Return the condition of a tracker; None represents a tracker that waits."""
+        """Return the condition of a tracker; None represents a tracker that waits for a start."""
         if tracker is None:
             return cls()
         silhouettes = tracker.silhouettes
@@ -99,7 +99,7 @@ def report_change(
 
 
 def reversed_gravity(up: Array) -> str:
-    """Return the text of a warning that an accelerometer reading was given as gravity.
+    """Return a warning that an accelerometer reading was given as gravity.
 
     Args:
         up: (3,) unit vector against gravity, camera frame.

@@ -28,7 +28,7 @@ class TrackStart:
 
     Attributes:
         parameters: parameters of the track.
-        body: body of the poses: the model, or the body of an initial mixture.
+        body: body of the track, from the parameters or from an initial mixture.
         background: (H, W, 3) BGR image of the empty scene; None: the background is learned.
         initial: prior of the first image; None: keypoints, a mask or a prediction start the track.
         box: (left, top, right, bottom) of a box around the person in the next image, px, which
@@ -45,7 +45,7 @@ class TrackStart:
         """Return the inputs that the start of the track waits for, in words.
 
         Args:
-            sources: inputs that may start a track if no start is given.
+            sources: inputs that may start a track without a box, subject or mixture.
         """
         if self.box is not None or isinstance(self.initial, GaussianMixture):
             return 'an image'
@@ -68,9 +68,9 @@ class TrackStart:
         """Return a tracker that waits for its first image.
 
         Args:
-            ground: gravity and floor, as far as they are known.
+            ground: gravity and floor, if known.
             shared: background that several trackers share and that is learned elsewhere; None:
-                the tracker learns its own.
+                the tracker learns its own background.
 
         Raises:
             ValueError: the background was taken by another camera, or the box is not in the image.
@@ -90,7 +90,7 @@ class TrackStart:
         return tracker
 
     def background_model(self, camera: Camera) -> BackgroundModel:
-        """Return the background model for a camera; it is unknown if no background is given.
+        """Return the background model for a camera; the model is unknown if none is given.
 
         Raises:
             ValueError: the background was taken by another camera.
@@ -117,14 +117,14 @@ def prepare_start(
     Args:
         mixture: hmt_msgs/PoseMixture to start from; if it is None or has no components, the track
             starts from the subject file.
-        present: body of the present track, if any; a mixture without segment lengths refers to it.
+        present: body of the present track, if any; its lengths apply if the mixture has none.
         region: sensor_msgs/RegionOfInterest of the person; None or zero width: unknown.
 
     Raises:
-        ValueError: a file or the mixture can not be used; one line with the reason.
+        ValueError: a file, the mixture or the region can not be used (one-line message).
     """
     body = _body(parameters.body_model)
-    known_lifter(parameters.tracker.lifter)  # only a check; the tracker loads it with the camera
+    known_lifter(parameters.tracker.lifter)  # only a check; the tracker loads it again
     background = read_picture(parameters.background_file) if parameters.background_file else None
     initial: Subject | GaussianMixture | None = None
     if mixture is not None and len(mixture.components):

@@ -1,4 +1,4 @@
-"""Parameters of the nodes that track, of one person and of several, and of offline replay."""
+"""Parameters of the nodes that track one person or several people, and of offline replay."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from hmt_ros.sessions.declared_parameters import (
 from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.ground import KnownGround
 
-# Evaluations of an image that let the node keep up with a camera.
-# Chosen by accuracy and time on tracked clips.
+# Number of evaluations per image with which the node keeps up with a camera, chosen by accuracy and
+# computing time on tracked clips.
 LIVE_BUDGET = 300
-# Settings that are parameters, with their limits.
+# Tracker settings that are parameters, with their limits.
 _TRACKER_SETTINGS = {
     'evaluation_budget': (1, 100_000),
     'max_hypotheses': (1, 64),
@@ -134,7 +134,7 @@ class FilterParameters(CameraNodeParameters):
 
     @property
     def uses_transforms(self) -> bool:
-        """Whether a frame is named that transforms lead to."""
+        """Whether the parameters name a frame, so that transforms are needed."""
         return bool(self.gravity_frame or self.fixed_frame)
 
     @property
@@ -144,7 +144,7 @@ class FilterParameters(CameraNodeParameters):
         return KnownGround(up, self.camera_height or None, math.radians(self.gravity_sigma))
 
 
-# Inputs of a single person, whose topics can not tell which person it is.
+# Values that disable the inputs for a single person, whose messages do not identify the person.
 _ONE_PERSON_INPUTS = {
     'subject_file': '',
     'use_predictions': False,

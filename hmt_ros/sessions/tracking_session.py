@@ -2,9 +2,9 @@
 
 The rules, in addition to those of `CameraSession`:
 
-- An image waits for the inputs that are used (`image_inputs`); keypoints without names, and
+- An image waits for the enabled inputs (`image_inputs`); keypoints without names, and
   mixtures without components, mean that nobody was seen.
-- A camera_info with another calibration, and ~/reset, restart the tracks.
+- A camera_info with a different calibration, and ~/reset, restart the tracks.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class TrackingState(CameraState):
         evaluations: number of evaluations of the likelihood in the last image.
         background: state of the background, in a few words.
         doubted: whether the background was learned with the person in it, and is still unknown.
-        track_id: number of the present or last track; 0 before the first.
-        started_from: input that the track started from; '' before the first.
+        track_id: number of the present or last track; 0 before the first track.
+        started_from: input that the track started from; '' before the first track.
         existence: probability that a person is in view; NaN before the first image.
         beliefs: probability that each cue shows the person, and that the track follows the person.
     """
@@ -167,8 +167,8 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
 
         Args:
             silence: time since the outputs for the newest image were published, s.
-            answered: value of the attribute `answered` then; if it has changed since, no messages
-                are returned.
+            answered: value of the attribute `answered` when `silence` was measured; if it has
+                changed since then, no messages are returned.
         """
         with self._shared.answering:
             if answered != self.answered:
@@ -221,13 +221,13 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
         return super()._read_input(row, message, stamp)
 
     def _prediction_in(self, message: Any) -> PosePrediction | Status | None:
-        """Return the mixture with its body; `NOBODY` if nobody was seen; None if not predicted.
+        """Return the mixture with its body; `NOBODY` if nobody was seen; None without a prediction.
 
         Raises:
-            ValueError: the message can not be used; one line.
+            ValueError: the message can not be used (one-line message).
         """
         if len(message.components) == 0:
-            # A predictor that leaves an image to the track does not know whether anybody is there.
+            # A predictor that has not evaluated an image does not know whether it shows anybody.
             left = message.state == TrackState.TRACKING or getattr(message, 'reason', '')
             return None if left else Status.NOBODY
         try:
@@ -237,7 +237,7 @@ class TrackingSession(CameraSession[FilterParameters, Any]):
             raise ValueError(f'pose_prediction: {error}') from error
 
     def _people_in(self, waiting: WaitingImage, camera: Camera) -> Iterator[tuple[Track, Seen]]:
-        """Yields each track with its evidence; the caller updates it before the next is yielded."""
+        """Yields each track with its evidence; the caller updates the track before the next one."""
         keypoints = self._keypoints.at_joints(
             waiting.content(KEYPOINTS),
             waiting.content(KEYPOINTS_3D),

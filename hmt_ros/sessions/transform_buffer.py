@@ -1,6 +1,6 @@
 """Transforms between frames over time, from the messages on /tf and /tf_static, without ROS.
 
-The rules are those of tf2: a frame has one parent; between two stamps rotations are interpolated on
+The rules are as in tf2: a frame has one parent; between two stamps rotations are interpolated on
 the shortest arc and positions along a line; nothing is extrapolated; a transform on /tf_static
 is valid at all times. The same messages in the same order give the same transforms.
 """
@@ -28,20 +28,20 @@ TRANSFORMS_TYPE = 'tf2_msgs/msg/TFMessage'
 # stamps per frame.
 MEMORY_TIME = 10.0
 MAX_FRAMES, MAX_STAMPS = 1000, 10_000
-# Maximum deviation of the length of a quaternion from 1, twice that of tf2.
+# Maximum deviation of the length of a quaternion from 1, twice the limit in tf2.
 _UNIT_TOLERANCE = 1e-2
 # Cosine of half the angle between two rotations above which interpolation is linear.
 _CLOSE_COSINE = 0.9995
-# Maximum number of names of frames in an error.
+# Maximum number of frame names in an error message.
 _MAX_LISTED_FRAMES = 12
 
 
 class TransformError(ValueError):
-    """No transform between two frames is known at a time; the text is one line with the reason."""
+    """No transform between two frames is known at a time; the message is one line."""
 
 
 class Transform(NamedTuple):
-    """p_parent = R p_child + t.
+    """Transform from a frame to its parent: p_parent = R p_child + t.
 
     Attributes:
         rotation: R (3, 3).
@@ -163,9 +163,9 @@ class TransformBuffer:
         self._frames = {name: x for name, x in self._frames.items() if x.static or x.places}
 
     def has_later(self, stamp_ns: int, timeout_ns: float) -> bool:
-        """Whether any moving frame has a place that is later than a stamp by more than a timeout.
+        """Whether any moving frame has a place that is more than a timeout later than a stamp.
 
-        A much later place does not count, because its stamp may be wrong.
+        A much later place is ignored, because its stamp may be wrong.
         """
         longest = timeout_ns + MEMORY_TIME * SECOND_NS
         return any(
@@ -225,7 +225,7 @@ class TransformBuffer:
         known.put(time_ns(stamped.header.stamp), sample)
 
     def _to_root(self, frame: str, stamp_ns: int) -> tuple[dict[str, Transform], str]:
-        """Return the transforms to all ancestors of a frame; why the root is not reached, or ''."""
+        """Return the transforms to a frame's ancestors, and why the root is not reached, or ''."""
         reached = {frame: Transform(np.eye(3), np.zeros(3))}
         here, total = frame, reached[frame]
         while (known := self._frames.get(here)) is not None:
@@ -269,7 +269,7 @@ def slerp(start: Array, end: Array, share: float) -> Array:
 
 
 def _name(frame: Any) -> str:
-    """Return the name of a frame as in tf2, without a leading slash as in tf."""
+    """Return a frame name in the style of tf2, without the leading slash of tf."""
     return str(frame).removeprefix('/')
 
 

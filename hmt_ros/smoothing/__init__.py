@@ -1,4 +1,4 @@
-"""Mixtures over trajectories: motions along a filter's chain, and VMS on independent mixtures."""
+"""Mixtures over trajectories, from a filter's chain of modes or from independent mixtures (VMS)."""
 
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mode_chain import Link, backward_weights, drawn_paths

@@ -6,8 +6,8 @@
 in closed form. If the state has velocities, the link integrates over the distribution of an unknown
 velocity.
 
-Paths are found by exact max-product over the layers, for all first nodes at once. The values of
-nodes and links are densities and can exceed 1; dynamic programming does not need bounded values.
+Paths are found by exact max-product over the layers, for all nodes of the first layer at once. The
+values of nodes and links are densities, so they can exceed 1; dynamic programming allows this.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def embedded_network(
         predicted[at] = product(means[at], own.T)
         spread[at] = product(product(own, covariances[at]), own.T) + noise
 
-    # All pairs at once: modes of the same time, and modes of successive times.
+    # Evaluate all pairs at once: modes of the same time, and modes of successive times.
     within = [_pairs_within(len(mixture)) for mixture in mixtures]
     node_pairs = np.concatenate([begin[t] + pairs for t, pairs in enumerate(within)], axis=1).T
     across = [_pairs_across(len(a), len(b)) for a, b in pairwise(mixtures)]
@@ -102,7 +102,7 @@ def embedded_network(
 
 
 def _node_values(weights: Array, densities: Array, pairs: Index) -> Array:
-    """Logs (K,) of densities summed over weighted modes, from log densities of pairs (2, P)."""
+    """Log node values (K,): log sums over weighted modes, from log densities of pairs (2, P)."""
     row, column = pairs
     log = np.empty((len(weights), len(weights)))
     log[row, column] = log[column, row] = densities
@@ -142,14 +142,15 @@ class Paths:
 
     @property
     def weights(self) -> Array:
-        """Probabilities (P,) of the paths, normalised over them."""
+        """Probabilities (P,) of the paths, normalised to sum 1."""
         return np.asarray(elementary.exp(self.log_values - log_sum_exp(self.log_values)))
 
 
 def k_best_paths(network: EmbeddedNetwork, k: int) -> Paths:
-    """The k best paths from every first to every last node, sorted from the best on.
+    """The k best paths from every first to every last node, best first.
 
-    The cost is O(K^3 k T log k). A pair of nodes with fewer than k paths gets all of them.
+    The cost is O(K^3 k T log k). If fewer than k paths connect two nodes, all of these are
+    returned.
 
     Raises:
         ValueError: k < 1.
@@ -186,11 +187,11 @@ def k_best_paths(network: EmbeddedNetwork, k: int) -> Paths:
 
 
 def diverse_subset(paths: Paths, count: int, penalty: float = 2.0) -> Paths:
-    """Probable paths that differ from each other, in the order of choice.
+    """Probable paths that differ from each other, in the order of selection.
 
-    Each choice maximises the log value minus a penalty, which at every time is proportional to the
-    share of chosen paths that visit the same node [after Batra et al., Diverse M-Best, ECCV 2012].
-    Without a penalty the best paths result.
+    Each selected path maximises its log value minus a penalty. At every time the penalty is
+    proportional to the share of the selected paths that visit the same node [after Batra et al.,
+    Diverse M-Best, ECCV 2012]. Without a penalty this gives the best paths.
 
     Raises:
         ValueError: count < 1.

@@ -3,12 +3,12 @@
     E(X) = -log p(x_1) - sum_t log p(x_t | x_(t-1)) - sum_t log p(r_t | x_t)                    (1)
     F(q) = E_q[log q(X) - log p(X, R)],    q = sum_i a_i N(M_i, s_i^2 S_i)                      (2)
 
-(1) is minimised within limits, from each distinct motion of a window. All motions use one prior: it
-has the largest of their noise factors, and fixes the feet that rest in the heaviest motion. If
-several optima are one motion, the most probable one is kept; (2) is over the kept optima. The
-adapted variables of (2) were chosen on clips (docs/smoothing.md). The chain of the filter's modes
-weighs motions better than (2), so an optimum gets the total weight of the motions that converged to
-it.
+(1) is minimised within limits, from each distinct motion of a window. All motions use one prior,
+which has the largest noise factor of the motions and fixes the feet that rest in the heaviest
+motion. If several optima are one motion, the most probable optimum is kept; the sum in (2) is over
+the kept optima. The adapted variables of (2) were chosen on clips (docs/smoothing.md). Weights from
+the chain of the filter's modes are better than weights from (2), so an optimum gets the total
+weight of the motions that converged to it.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from hmt_ros.smoothing.variational_mixture import minimise_free_energy
 
 # Maximum number of refined motions, and minimum weight of a refined motion.
 MAX_MOTIONS, MIN_WEIGHT = 4, 0.01
-# Maximum number of steps of a descent, and gain of a step below which it ends, nats.
+# Maximum number of steps of a descent, and gain of a step below which the descent ends, nats.
 STEPS, TOLERANCE = 30, 0.01
-# Number of samples per optimum, and of iterations, of the descent of the free energy.
+# Number of samples per optimum and number of iterations in the descent of the free energy.
 SAMPLES, ITERATIONS = 4, 15
 
 
@@ -46,16 +46,16 @@ def refined_on_images(
     """Refine the distinct motions of a window.
 
     Args:
-        smoother: smoother of the motions.
+        smoother: smoother that estimated the motions.
         found: motions of a whole sequence, without a past.
         images: likelihood of the images of the window, one for each time.
-        adapt: variables of the free energy, some of 'weights' and 'inflation'.
+        adapt: adapted variables of the free energy, a subset of 'weights' and 'inflation'.
 
     Returns:
         The distinct optima with their free energy, and the other motions, unchanged.
 
     Raises:
-        ValueError: the number of images is wrong.
+        ValueError: the number of images differs from the number of times.
     """
     motions, low_high = found.trajectories, smoother.limits()
     assert motions.stamps_ns is not None
@@ -83,7 +83,7 @@ def refined_on_images(
     origin = chosen[optima.starts]
     kept, labels = _first_of_each(smoother, motions, optima.states, motions.weights[origin], 0.0)
     optima, others = optima[kept], np.setdiff1d(np.arange(len(motions)), chosen)
-    # Matrix that maps each motion to its component of the result.
+    # Matrix that maps each motion to a component of the result.
     count = len(kept)
     into = np.zeros((len(motions), count + len(others)))
     into[origin, labels] = 1.0
@@ -135,7 +135,7 @@ def _first_of_each(
     weights: Array,
     least: float,
 ) -> tuple[Index, Index]:
-    """Group states (N, T, n) into motions; return the first index of each, and labels (N,)."""
+    """Group states (N, T, n) into motions; return each motion's first index, and labels (N,)."""
     assert motions.stamps_ns is not None
     points = smoother.points_of(states[:, :, : motions.dimension]).swapaxes(0, 1)
     nodes = np.broadcast_to(np.arange(len(states))[:, None], states.shape[:2])

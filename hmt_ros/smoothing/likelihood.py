@@ -1,6 +1,6 @@
 """Likelihoods of observations for a smoother: -log p(r_t | x_t), its gradient and its curvature.
 
-A likelihood is made of the mixtures of a filter (`MixtureLikelihood`), or is another `EnergyTerm`
+A likelihood is either made of a filter's mixtures (`MixtureLikelihood`), or any other `EnergyTerm`
 whose rows are times, such as the likelihood of the images themselves (VMS 5).
 """
 
@@ -36,8 +36,8 @@ class MixtureLikelihood:
     With y_k = W_k (x - m_k), S_k^-1 = W_k' W_k, responsibilities r_k and u_k = W_k' y_k, the
     gradient of -log p is u = sum_k r_k u_k and its Hessian sum_k r_k S_k^-1 - (sum_k r_k u_k u_k' -
     u u'). Without the part in brackets, this is the Hessian of the quadratic that
-    expectation-maximisation minimises. The quadratic lies above -log p, so a full step never
-    ascends.
+    expectation-maximisation minimises. This quadratic lies above -log p, so a full step never
+    increases -log p.
 
     Attributes:
         first: (T+1,) index of the first mode of each time; time t has first[t] .. first[t+1] - 1.
@@ -55,11 +55,11 @@ class MixtureLikelihood:
 
     @classmethod
     def of(cls, mixtures: Sequence[GaussianMixture]) -> MixtureLikelihood:
-        """The likelihood of a sequence of mixtures; modes without weight are left out.
+        """The likelihood of a sequence of mixtures; modes of weight 0 are left out.
 
         Raises:
-            ValueError: a mixture has no modes or weight, another dimension, or a covariance that is
-                not positive definite.
+            ValueError: a mixture has no modes, no weight, a different dimension, or a covariance
+                that is not positive definite.
         """
         check_mixtures(mixtures)
         kept = [mixture[mixture.weights > 0] for mixture in mixtures]
@@ -114,7 +114,7 @@ class MixtureLikelihood:
 
 @dataclass(frozen=True, eq=False)
 class LikelihoodPart:
-    """The likelihood of some consecutive times.
+    """The part of a likelihood for some consecutive times.
 
     Attributes:
         whole: likelihood of all times.
@@ -134,16 +134,16 @@ class LikelihoodPart:
 
 
 def counted(mixture: GaussianMixture, share: float) -> GaussianMixture:
-    """Discount the likelihood of an observation that has only a share a of new information.
+    """Discount the likelihood of an observation of which only a share a is new information.
 
         sum_k v_k N(m_k, S_k / a) / sum_k v_k,        v_k = w_k^a |S_k|^((1 - a) / 2)
 
-    If errors persist, each observation repeats a part of the information of earlier ones, and is
-    used with the share a (`inference.error_model`). The density near each mode is then w_k N(m_k,
-    S_k) to the power a.
+    If errors persist, each observation repeats a part of the information in earlier observations.
+    Only the share a of its information is used (`inference.error_model`). The density near each
+    mode is then w_k N(m_k, S_k) to the power a.
 
     Args:
-        mixture: likelihood without discount; modes without weight are left out.
+        mixture: likelihood before the discount; modes of weight 0 are left out.
         share: share a of new information.
 
     Raises:
@@ -158,10 +158,10 @@ def counted(mixture: GaussianMixture, share: float) -> GaussianMixture:
 
 
 def check_mixtures(mixtures: Sequence[GaussianMixture]) -> None:
-    """Checks that the mixtures of a window, one for each time, can be smoothed.
+    """Checks that the mixtures of a window, one for each time, are valid inputs of a smoother.
 
     Raises:
-        ValueError: a mixture can not be smoothed; the message gives its index.
+        ValueError: a mixture is invalid; the message gives the index of the mixture.
     """
     if len(mixtures) == 0:
         raise ValueError('no mixtures to smooth; wanted one for each time')

@@ -1,4 +1,4 @@
-"""Variational mixture smoothing: a mixture over trajectories from one per time (VMS fig. 1)."""
+"""Variational mixture smoothing: from mixtures over poses to one over trajectories (VMS fig. 1)."""
 
 from __future__ import annotations
 
@@ -28,28 +28,29 @@ from hmt_ros.smoothing.variational_mixture import (
 
 # Maximum number of noise values in the descent of the free energy, which limits the samples.
 SAMPLE_BUDGET = 400_000
-# Minimum weight of a component in the descent, relative to the heaviest one.
+# Minimum weight of a component in the descent, relative to the heaviest component.
 MIN_RELATIVE_WEIGHT = 1e-6
-# Minimum number of images for which the parts of paths that differ from the best path are refined
-# first, and margin of such a part on either side, images.
+# Minimum length of a sequence in which parts that differ from the best path are refined first, and
+# margin on either side of such a part, images.
 LONG_WINDOW = 100
 PART_MARGIN = 8
-# Distance from an optimum below which the Gaussian of a path is redundant, standard deviations.
+# Distance from an optimum below which a path's Gaussian is redundant, standard deviations.
 SAME_DISTANCE = 0.3
-# Distances below which modes are merged to get alternatives to the optima, standard deviations.
+# Mode distances below which modes are merged, to get alternatives to the optima, standard
+# deviations.
 MERGE_DISTANCES = (1.75, 2.5)
 
 
 @dataclass(frozen=True, eq=False)
 class MixtureSmoother:
-    """Smooths sequences of mixtures with independent errors; otherwise see `likelihood.counted`.
+    """Smooths mixtures with independent errors; for persistent errors see `likelihood.counted`.
 
     Attributes:
         dynamics: dynamics of the state.
         lower, upper: (d,) limits of the pose at every time; None: no limits.
         max_trajectories: maximum number of components of the result.
-        adapt: variables of the descent of the free energy, some of `ADAPTED_PARAMETERS`; empty: no
-            descent.
+        adapt: variables adapted by the descent of the free energy, a subset of
+            `ADAPTED_PARAMETERS`; empty: no descent.
         max_iterations: maximum number of iterations of the descent of the free energy.
 
     Raises:
@@ -79,7 +80,7 @@ class MixtureSmoother:
         stamps_ns: Sequence[int] | None = None,
         observation: SequenceLikelihood | None = None,
     ) -> TrajectoryMixture:
-        """Smooth likelihood mixtures, one for each time, to a mixture over trajectories.
+        """Compute a mixture over trajectories from likelihood mixtures, one for each time.
 
         Args:
             mixtures: T likelihoods over the pose, whose weights need not sum to 1.
@@ -111,7 +112,7 @@ class MixtureSmoother:
         stamps_ns: Sequence[int] | None = None,
         observation: SequenceLikelihood | None = None,
     ) -> TrajectoryMixture:
-        """Smooth inputs that have been checked; see `smooth`."""
+        """Smooth inputs that are already checked; see `smooth`."""
         likelihood = sequence.likelihood if observation is None else observation
         best, least = self.optima(sequence, likelihood), np.nan
         for other in self.merged_paths(sequence) if observation is None else ():
@@ -123,16 +124,16 @@ class MixtureSmoother:
         return self._fitted(best, sequence.prior, likelihood, seed, stamps_ns)
 
     def paths(self, sequence: ModeSequence) -> Paths:
-        """Return the initial paths of trajectories."""
+        """Return the paths from which trajectories start."""
         return sequence.paths(self.max_trajectories)
 
     def optima(self, sequence: ModeSequence, likelihood: SequenceLikelihood) -> TrajectoryGaussians:
-        """Return distinct optima of the paths, and further paths if the optima are few."""
+        """Return distinct optima from the paths and, if there are few, Gaussians of other paths."""
         low, high = self._limits()
         prior, paths = sequence.prior, self.paths(sequence)
         d = prior.dimension
         starts = sequence.states(paths)
-        # Parts that other paths share with the best path are refined once.
+        # Refine parts that other paths share with the best path only once.
         best = refine(starts[:1], prior, likelihood, low[:d], high[:d])
         shared = paths.nodes == paths.nodes[0]
         starts = np.where(shared[:, :, None], best.states, starts)
@@ -145,7 +146,8 @@ class MixtureSmoother:
         room = self.max_trajectories - len(refined)
         if room == 0 or len(refined) == len(paths) or likelihood is not sequence.likelihood:
             return result
-        # Overlapping modes share an optimum, which one Gaussian describes badly.
+        # Overlapping modes share an optimum, but one Gaussian at this optimum is a poor
+        # approximation.
         beside = path_gaussians(paths.nodes, prior, sequence.likelihood)
         distinct = [
             i
@@ -162,7 +164,7 @@ class MixtureSmoother:
         )
 
     def merged_paths(self, sequence: ModeSequence) -> Iterator[TrajectoryGaussians]:
-        """Yield Gaussians of paths through merged modes, for each distance that merges modes."""
+        """Yield Gaussians of paths through merged modes, for each of the `MERGE_DISTANCES`."""
         count = sum(len(mixture) for mixture in sequence.mixtures)
         for distance in MERGE_DISTANCES:
             merged = sequence.merged(distance)
@@ -190,7 +192,7 @@ class MixtureSmoother:
         seed: int,
         max_iterations: int,
     ) -> VariationalMixture:
-        """Optimise the heavy components, and leave the others unchanged."""
+        """Optimise heavy components, and leave light components unchanged."""
         low, high = self._limits()
         weights, means = candidates.weights, candidates.states.copy()
         heavy = weights > MIN_RELATIVE_WEIGHT * weights.max()
@@ -295,14 +297,15 @@ def with_refined_parts(
     lower: Array,
     upper: Array,
 ) -> Array:
-    """Optimise the parts of initial trajectories (M, T, n) that differ from the first one.
+    """Optimise those parts of initial trajectories (M, T, n) that differ from the first trajectory.
 
-    The paths of a long sequence agree except near its ends, and many share the same ends. The
-    differing parts are few and short, while a step of a whole trajectory evaluates all images.
+    In a long sequence most paths differ only near its ends, and many have the same ends. The
+    differing parts are therefore few and short, while a step of a whole trajectory evaluates all
+    images.
 
     Args:
-        starts: (M, T, n) initial trajectories; the first one is an optimum.
-        shared: (M, T) whether each state equals that of the first one.
+        starts: (M, T, n) initial trajectories, of which the first is an optimum.
+        shared: (M, T) whether each state equals the first trajectory's state at that time.
     """
     times = starts.shape[1]
     parts: dict[tuple[int, int], list[int]] = {}
@@ -332,7 +335,7 @@ def intervals_of(stamps_ns: Sequence[int] | None, times: int, step: float) -> Ar
     """Return the intervals (T-1,) between successive times, s.
 
     Raises:
-        ValueError: the number of stamps is wrong, or a stamp does not increase.
+        ValueError: the number of stamps is wrong, or the stamps do not increase.
     """
     if stamps_ns is None:
         return np.full(times - 1, step)

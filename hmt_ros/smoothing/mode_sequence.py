@@ -1,8 +1,8 @@
-"""The modes of a sequence of mixtures under a dynamical model, and the Gaussians of their paths.
+"""Modes of a sequence of mixtures under a dynamical model, and Gaussians of paths through them.
 
-Overlapping modes are one explanation of the observation rather than two. If they are merged into
-one Gaussian of the same mean and covariance, a path represents all paths through the merged modes,
-and fewer trajectories cover the same posterior (VMS 4).
+Overlapping modes are a single explanation of the observation. If they are merged into one Gaussian
+of the same mean and covariance, one path represents all paths through them, so that fewer
+trajectories cover the posterior (VMS 4).
 
 If the likelihood is a mixture at every time, the posterior is a mixture too, with a component for
 every path k = (k_1 .. k_T):
@@ -11,8 +11,8 @@ every path k = (k_1 .. k_T):
 
     log w_k = sum_t log (w_{k_t} N(0; m_{k_t}, S_{k_t})) + (M_k' P_k M_k - log |P_k / 2 pi|) / 2 - c
 
-with P, h and c from the prior. If modes overlap, there are fewer optima than paths; these Gaussians
-then complement the optima.
+with P, h and c from the prior. If modes overlap, there are fewer optima than paths. The Gaussians
+of paths then complement the optima.
 """
 
 from __future__ import annotations
@@ -77,15 +77,15 @@ class ModeSequence:
     def paths(self, count: int) -> Paths:
         """Return at most `count` probable paths that differ from each other.
 
-        Candidates are the best path for each pair of ends, and further paths for the same pairs if
-        these are too few.
+        Candidates are the best path for each pair of ends and, if these are too few, further paths
+        for the same pairs.
         """
         pairs = len(self.network.nodes[0]) * len(self.network.nodes[-1])
         per_pair = 1 if pairs >= count else -(-CANDIDATES_PER_PATH * count // pairs)
         return diverse_subset(k_best_paths(self.network, per_pair), count)
 
     def states(self, paths: Paths) -> Array:
-        """States (P, T, n) along the modes of paths; velocities are differences of neighbours."""
+        """States (P, T, n) at the modes of paths, with velocities from differences over time."""
         d, n = self.dynamics.dimension, self.dynamics.state_dimension
         result = np.zeros((len(paths), len(self.mixtures), n))
         for t, mixture in enumerate(self.mixtures):
@@ -96,7 +96,7 @@ class ModeSequence:
         return result
 
     def merged(self, distance: float) -> ModeSequence:
-        """Merge modes closer than a distance, in standard deviations."""
+        """Merge modes that are closer than `distance` standard deviations."""
         mixtures = tuple(merged_if_close(mixture, distance) for mixture in self.mixtures)
         return replace(self, mixtures=mixtures)
 
@@ -117,14 +117,14 @@ class TrajectoryGaussians:
 
     @property
     def weights(self) -> Array:
-        """Proportions (P,)."""
+        """Proportions (P,) of the components."""
         return np.asarray(elementary.exp(self.log_weights - log_sum_exp(self.log_weights)))
 
 
 def path_gaussians(
     nodes: Index, prior: TrajectoryPrior, likelihood: MixtureLikelihood
 ) -> TrajectoryGaussians:
-    """The posterior components of paths, given as indices (P, T) of modes with weight."""
+    """The posterior components of paths (P, T), given as indices of modes with positive weight."""
     count, times = nodes.shape
     n, d = prior.information.shape[1], prior.dimension
     states, log_weights, factors = np.empty((count, times, n)), np.empty(count), []

@@ -1,4 +1,4 @@
-"""The states of motions, smoothed over the evidence of the images (VMS 5, in closed form).
+"""Smoothing of motions: states from the evidence of the images (VMS 5, in closed form).
 
     E(X) = |x_1 - m_1|^2_(P_1) / 2 + sum_t |x_(t+1) - A x_t|^2_(l_t Q) / 2
            + sum_t |x_t - z_t|^2_(R_t) / 2
@@ -6,9 +6,9 @@
 z_t and R_t are the mean and covariance of the motion's modes in an image (`motions`), N(m_1, P_1)
 is the prediction of the first state from the motion's past. l_t scales the noise of the motion
 prior; it is the smallest of 1, 4, 16, 64 that keeps the states close to the motion's modes. An
-image whose modes are far from the states is an outlier and gets a low weight. A past that is far
-from all modes of its motion is ignored. E is quadratic with a block-tridiagonal Hessian; states are
-clipped to the limits.
+image whose modes are far from the states is an outlier and gets a low weight. A prediction from the
+past that is far from all modes of its motion is ignored. E is quadratic with a block-tridiagonal
+Hessian; states are clipped to the limits.
 """
 
 from __future__ import annotations
@@ -46,16 +46,17 @@ from hmt_ros.smoothing.motions import (
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import limits_of_states
 
-# Number of paths drawn from the chain.
+# Number of paths drawn from the chain of modes.
 PATH_SAMPLES = 96
 # Values of l, and the median distance from the modes above which the next value is tried, m.
 NOISE_FACTORS, MAX_MEDIAN_DISTANCE = (1.0, 4.0, 16.0, 64.0), 0.05
-# Distance of an image's modes from the states above which the image is an outlier, m, and maximum
-# number of passes that reduce the weights of outliers.
+# Distance between an image's modes and the states above which the image is an outlier, m, and
+# maximum number of passes that reduce weights of outliers.
 WRONG_DISTANCE, MAX_WRONG_PASSES = 0.15, 3
 # Distance from all motions above which a mode is a stray, m.
 STRAY_DISTANCE = 0.05
-# Minimum weight of a motion over several images, and of a motion whose resting points are fixed.
+# Minimum weight of a motion in a window of several images, and of a motion whose resting points are
+# fixed.
 MIN_WEIGHT, MIN_RESTING_WEIGHT = 0.03, 0.1
 
 
@@ -64,9 +65,9 @@ class ImageModes(NamedTuple):
 
     Attributes:
         stamp_ns: stamp of the image, ns.
-        link: posterior weights and ancestry of its K modes.
+        link: posterior weights and ancestry of the K modes.
         mixture: the undiscounted likelihood of the image, K components; weights are not used.
-        errors: model of errors that persist from image to image.
+        errors: model of the errors that persist from image to image.
     """
 
     stamp_ns: int
@@ -82,7 +83,8 @@ class WindowImage(NamedTuple):
         modes: the modes of the image.
         counted: the likelihood, with covariances that account for persistent errors.
         points: (K, P, 3) points of the modes, m.
-        persistence_ratio: factor on the posterior variance, because the image's errors persist.
+        persistence_ratio: factor on the posterior variance, for errors that persist from image to
+            image.
         alone: factor on the covariances of modes that belong to no motion.
     """
 
@@ -97,7 +99,7 @@ class FirstStates(NamedTuple):
     """Gaussian prediction of the first states of M motions of a window.
 
     Attributes:
-        means, covariances: (M, n) and (M, n, n) moments of the states.
+        means, covariances: (M, n) and (M, n, n) means and covariances of the states.
         noise_factor: (M,) noise factor l of each motion's predecessor.
     """
 
@@ -110,9 +112,9 @@ class Past(NamedTuple):
     """Prediction for the first image of a window, from earlier images.
 
     Attributes:
-        shares: (K, M) probability that each mode of the image continues each of M motions.
-        first: states that these motions predict.
-        places: (M, P, 3) points of the motions in the last image, m.
+        shares: (K, M) probability that a mode of the image continues each of M earlier motions.
+        first: predicted first state of each of these motions.
+        places: (M, P, 3) points of the motions in the previous image, m.
     """
 
     shares: Array
@@ -145,10 +147,10 @@ class MotionStates(NamedTuple):
     Attributes:
         states: (T, n) smoothed states.
         factor: Cholesky factor of the precision of the states.
-        log_joint: log p(X, R), with Gaussian image likelihoods.
+        log_joint: log p(X, R) with Gaussian likelihoods of the images.
         noise_factor: noise factor l.
-        precision_factors: (T,) factor on the precision of each image.
-        fresh: whether the motion ignores the past.
+        precision_factors: (T,) factor on the precision of each image's evidence.
+        fresh: whether the prediction from the past is ignored.
     """
 
     states: Array
@@ -164,10 +166,10 @@ class SmoothedMotions(NamedTuple):
 
     Attributes:
         trajectories: the M trajectories.
-        shares: T arrays (K_t, M), probabilities that each mode belongs to each motion.
+        shares: T arrays (K_t, M), probability that a mode belongs to each motion.
         evidence: evidence of the images; outlier images have larger covariances.
         noise_factor: (M,) noise factor l.
-        fresh: (M,) whether a motion ignores the past.
+        fresh: (M,) whether the prediction from the past is ignored for a motion.
         first: prediction from the past; None: no past.
     """
 
@@ -186,11 +188,11 @@ class MotionSmoother:
     Attributes:
         dynamics: dynamics of the state.
         lower, upper: (d,) limits of the pose at every time; None: no limits.
-        points: maps poses (N, d) to points (N, P, 3), m, by which motions are compared; None: the
-            variables of the pose.
+        points: maps poses (N, d) to points (N, P, 3), m, for the comparison of motions; None: the
+            variables of the pose are compared.
         max_motions: maximum number of motions.
-        resting: points that may rest on the ground; None: not used.
-        seed: random seed of the drawn paths.
+        resting: model of points that can rest on the ground; None: not used.
+        seed: random seed for drawing paths.
 
     Raises:
         ValueError: a setting is out of range.
@@ -222,7 +224,7 @@ class MotionSmoother:
         return np.asarray(found.reshape(*poses.shape[:-1], *found.shape[1:]))
 
     def image(self, modes: ImageModes, before_ns: int | None) -> WindowImage:
-        """Prepare an image of a window; `before_ns` is the last stamp, None for the first image.
+        """Prepare an image of a window; `before_ns`: previous stamp, or None for the first image.
 
         Raises:
             ValueError: the modes can not be smoothed, or the stamp does not increase.
@@ -259,7 +261,7 @@ class MotionSmoother:
         """The motions of a whole sequence.
 
         Raises:
-            ValueError: no images, a stamp does not increase, or modes can not be smoothed.
+            ValueError: there are no images, stamps do not increase, or modes can not be smoothed.
         """
         if not sequence:
             raise ValueError('no images to smooth')
@@ -268,7 +270,7 @@ class MotionSmoother:
         return self.smoothed(images)
 
     def smoothed(self, images: Sequence[WindowImage], past: Past | None = None) -> SmoothedMotions:
-        """The motions of the images of a window."""
+        """Estimate the motions in the images of a window."""
         stamps = [image.modes.stamp_ns for image in images]
         links = [image.modes.link for image in images]
         nodes, weights = drawn_paths(links, PATH_SAMPLES, self.seed)
@@ -323,7 +325,7 @@ class MotionSmoother:
     def _with_weights_in_time(
         self, found: TrajectoryMixture, images: Sequence[WindowImage], shares: Sequence[Array]
     ) -> TrajectoryMixture:
-        """Add weights at each time: the sum over the modes nearest to each trajectory."""
+        """Add weights at each time: sums over the modes nearest to each trajectory."""
         smoothed = backward_weights([image.modes.link for image in images])
         every = self.points_of(found.means).swapaxes(0, 1)
         weights, strays = np.zeros((found.times, len(found))), []
@@ -341,7 +343,7 @@ class MotionSmoother:
         return replace(found, weights_in_time=weights, strays=tuple(strays))
 
     def _first(self, past: Past, nodes: Index, weights: Array, labels: Index) -> FirstStates:
-        """Predict the first state of each motion, averaged over its paths."""
+        """Predict the first state of each motion as an average over the motion's paths."""
         shares = np.zeros((int(labels.max()) + 1, past.shares.shape[1]))
         np.add.at(shares, labels, weights[:, None] * past.shares[nodes])
         shares /= shares.sum(1, keepdims=True)
@@ -360,7 +362,7 @@ class MotionSmoother:
         m: int,
         held: bool,
     ) -> MotionStates:
-        """Compute the states of motion m; `held` fixes its resting points."""
+        """Compute the states of motion m; `held`: whether to fix the motion's resting points."""
         dynamics, d = self.dynamics, self.dynamics.dimension
         means, precisions = evidence.means[m], inverse(evidence.covariances[m])
         places, precision_factors = self.points_of(means), np.ones(len(means))
@@ -396,7 +398,8 @@ class MotionSmoother:
         seen += 0.5 * product(at, pull_of_first) + couplings.constant(noise)
         gained = 0.5 * (product(states[0], pull_of_first) + (states[:, :d] * pull).sum())
         if held and self.resting is not None and len(states) > 1:
-            # Covariances ignore resting points, because rest is one decision for all images.
+            # Covariances ignore resting points, because whether a point rests is one decision for
+            # all images.
             poses = np.clip(states, *self.limits())[:, :d]
             resting = self.resting.along(poses, evidence.covariances[m], intervals)
             if resting is not None:
@@ -411,12 +414,12 @@ class MotionSmoother:
         return np.asarray(mean_distances(self.points_of(poses), places))
 
     def past_after(self, found: SmoothedMotions, count: int, after: ImageModes) -> Past:
-        """Predict the image that follows the images which leave a window.
+        """Predict the next image from the images that leave a window.
 
         Args:
             found: the motions of the window.
             count: number of images that leave the window.
-            after: the next image after the leaving ones.
+            after: modes of the image that follows the leaving images.
         """
         dynamics, evidence = self.dynamics, found.evidence
         d = dynamics.dimension
@@ -453,7 +456,7 @@ class MotionSmoother:
 
 
 def _shares(nodes: Index, weights: Array, labels: Index, count: int, masses: Array) -> Array:
-    """Return the probability (K, M) that each mode of an image belongs to each motion."""
+    """Return probabilities (K, M) that a mode of an image belongs to each motion."""
     result = np.zeros((count, len(masses)))
     np.add.at(result, (nodes, labels), weights)
     result[~result.any(1)] = masses

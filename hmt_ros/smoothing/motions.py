@@ -1,19 +1,19 @@
-"""Motions: groups of close paths through the modes of a window, and their image evidence.
+"""Motions: groups of close paths through the modes of a window, and evidence about motions.
 
     d(a, b) = max over moments of mean_s min((mean_j |a_sj - b_sj|^2)^(1/2), c)             (1)
     z_t = sum_k r_k x_k,  R_t = sum_k r_k (S_k / b + (x_k - z_t)(x_k - z_t)')               (2)
 
 a_sj is the mean position of joint j over span s, a sixth of a second; a moment is three successive
-spans. Paths closer than 30 mm are one motion. The mean is over squares, so that one differing limb
-is not lost among equal joints. The distance in a span is limited to c = 90 mm, so that a difference
-in a single span, however large, does not separate two motions. The past motion that a path
-continues gives an extra span before the first. Spans without an image are skipped; in a window
-shorter than a moment the mean is over the window.
+spans. Paths closer than 30 mm are one motion. The mean over joints is of squared distances, so that
+one differing limb is not averaged out. The distance in a span is limited to c = 90 mm, so that a
+difference in a single span, however large, does not separate two motions. If a path continues an
+earlier motion, this motion gives an extra span before the first. Spans without an image are
+skipped. In a window shorter than a moment the mean is over the whole window.
 
 A motion's modes in an image are merged into one Gaussian (2); r_k is the fraction of the motion's
 paths through mode k. Modes far from the heaviest mode are left out, because the mean of two
-opposite poses is no pose. b is the image's share of evidence on changes (`CueErrors.of_changes`). R
-includes the covariance between the modes.
+opposite poses is not a valid pose. b is the image's share of evidence about changes
+(`CueErrors.of_changes`). R includes the covariance between the modes.
 """
 
 from __future__ import annotations
@@ -37,12 +37,13 @@ SPAN_TIME, SPANS_PER_MOMENT = 1.0 / 6.0, 3
 
 
 class MotionEvidence(NamedTuple):
-    """Evidence of the images of a window on M motions, equation (2).
+    """Evidence from the images of a window about M motions, equation (2).
 
     Attributes:
         means: (M, T, d) z_t of each motion.
         covariances: (M, T, d, d) R_t of each motion.
-        disagreements: (M, T, d, d) covariance between the merged modes, part of the covariances.
+        disagreements: (M, T, d, d) covariance between the merged modes, which is included in
+            `covariances`.
     """
 
     means: Array
@@ -53,13 +54,13 @@ class MotionEvidence(NamedTuple):
 def path_distances(
     nodes: Index, points: Sequence[Array], stamps: Sequence[int], before: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return distances (N, N) of paths, m: equation (1), and unlimited means over all spans.
+    """Return distances (N, N) between paths, m: equation (1), and means over spans without limit c.
 
     Args:
         nodes: (N, T) modes of the paths.
         points: T arrays (K_t, P, 3), points of the modes, m.
         stamps: (T,) stamps of the images, ns.
-        before: (N, P, 3) points of each path in the span before the first, m; None: unknown.
+        before: (N, P, 3) points of each path in the span before the first image, m; None: unknown.
     """
     ages = (stamps[-1] - np.asarray(stamps, dtype=np.int64)) / SECOND_NS
     spans = np.floor(ages / SPAN_TIME + 1e-3).astype(np.intp)
@@ -70,7 +71,7 @@ def path_distances(
     if before is not None:
         apart[max(apart) + 1] = _apart([before])
     known = np.array([*apart])
-    # Oldest span of each moment; moments with the same images count once.
+    # Oldest span of each moment; moments that contain the same images are evaluated once.
     ends = (
         np.unique([known, known + SPANS_PER_MOMENT - 1])
         .clip(SPANS_PER_MOMENT - 1)
@@ -84,7 +85,7 @@ def path_distances(
 
 
 def _apart(places: Sequence[Array]) -> Array:
-    """Return distances (N, N) of paths over a span, from points (N, P, 3) in its images, m."""
+    """Return distances (N, N) between paths over a span, m, from points (N, P, 3) in each image."""
     means = np.mean(places, axis=0)
     apart = distances(means.reshape(len(means), -1))
     return np.asarray(apart / np.sqrt(means.shape[1]))
@@ -93,15 +94,16 @@ def _apart(places: Sequence[Array]) -> Array:
 def grouped(weights: Array, distances: Array, means: Array, most: int, least: float) -> Index:
     """Return the motion (N,) of each path, numbered by weight.
 
-    Motions are found one by one: the path with the largest total weight of paths within
-    `SAME_MOTION_DISTANCE` is the next leader. Every path belongs to the leader at the least mean
+    Motions are found one by one: the next leader is the path with the largest remaining weight of
+    paths within `SAME_MOTION_DISTANCE`. Every path belongs to the leader at the smallest mean
     distance.
 
     Args:
         weights: (N,) weights of the paths, with sum 1.
-        distances, means: (N, N) distances of the paths, m, see `path_distances`.
+        distances, means: (N, N) distances between the paths, m, see `path_distances`.
         most: maximum number of motions.
-        least: minimum weight of a motion; paths of lighter motions are given to the others.
+        least: minimum weight of a motion; paths of lighter motions are assigned to the remaining
+            motions.
     """
     near, left, leaders = distances <= SAME_MOTION_DISTANCE, weights.copy(), list[int]()
     while len(leaders) < most and left.any():
@@ -125,7 +127,7 @@ def evidence_of_motions(
     mixtures: Sequence[GaussianMixture],
     points: Sequence[Array] | None = None,
 ) -> MotionEvidence:
-    """Compute the evidence of images on each motion.
+    """Compute the evidence from images about each motion.
 
     Args:
         nodes: (N, T) modes of the paths.

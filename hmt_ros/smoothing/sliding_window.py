@@ -2,8 +2,8 @@
 
 The window contains the newest images. The evidence of earlier images is kept as a state for each
 motion (`Past`), so that the cost per image does not depend on the length of the sequence. A pose
-becomes final before it is older than the newest pose by more than the lag plus the time between two
-smoothings.
+becomes final at the latest when its age relative to the newest pose is the lag plus the time
+between two smoothings.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from hmt_ros.smoothing.motion_smoother import (
 from hmt_ros.smoothing.motions import SAME_MOTION_DISTANCE, SECOND_NS
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 
-# Relative variation of the intervals between poses.
+# Assumed relative jitter of the intervals between poses.
 INTERVAL_JITTER = 0.1
 
 
@@ -39,7 +39,7 @@ class FinalPose:
 
     Attributes:
         stamp_ns: time of the pose, ns.
-        trajectories: the M trajectories of the window.
+        trajectories: the M trajectories over the window that contains the pose.
         t: index of the pose in the window.
     """
 
@@ -89,8 +89,8 @@ class SlidingWindow:
     images in the same order give the same numbers.
 
     Args:
-        fixed_lag: maximum age of a pose relative to the newest pose, s; a pose becomes final if the
-            next image, expected after the same interval, would make it older. 0 is filtering;
+        fixed_lag: maximum age of a pose relative to the newest pose, s. A pose becomes final if it
+            would exceed this age at the next image, expected after the same interval. 0: filtering;
             infinite: no pose is final before the end.
         every: minimum time between two smoothings, s; poses become final only in a smoothing.
 
@@ -116,13 +116,13 @@ class SlidingWindow:
         self.reset()
 
     def reset(self) -> None:
-        """Clear the window; the next image is the first."""
+        """Clear the window; the next image starts a new sequence."""
         self.next_identity = self.first_identity
         self._images: list[WindowImage] = []
         self._past: Past | None = None
         self._found: SmoothedMotions | None = None
         self._last: TrajectoryMixture | None = None
-        # Number of final images, the oldest of the window.
+        # Number of final images, which are the oldest in the window.
         self._final = 0
 
     @property
@@ -171,7 +171,7 @@ class SlidingWindow:
             self._final = 0
 
     def _is_due(self, interval: float) -> bool:
-        """Whether to smooth the window now, `interval` s after the last pose."""
+        """Whether to smooth the window now; `interval` is the time since the previous pose, s."""
         if self._last is None or self._last.stamps_ns is None:
             return True
         since = (self.stamps_ns[-1] - self._last.stamps_ns[-1]) / SECOND_NS
@@ -187,7 +187,8 @@ class SlidingWindow:
             return len(stamps)
         if len(stamps) < 2:
             return 0
-        # Poses that would be too old at the next image; the margin allows for jitter of stamps.
+        # Count poses that would be too old at the next image; the margin allows for jitter of
+        # stamps.
         interval = stamps[-1] - stamps[-2]
         until = stamps[-1] + interval - lag - round(INTERVAL_JITTER * interval)
         return sum(stamp < until for stamp in stamps[:-1])
@@ -211,11 +212,12 @@ class SlidingWindow:
         return replace(found, identities=self._identities(found))
 
     def _identities(self, found: TrajectoryMixture) -> tuple[int, ...]:
-        """Return identities of trajectories, inherited from predecessors, heaviest first.
+        """Return identities of trajectories, inherited from predecessors in order of weight.
 
-        The predecessor is a trajectory of the last smoothing that is closer than
-        `SAME_MOTION_DISTANCE` and has no heavier successor; of several, the one with the least
-        distance divided by its weight. A trajectory without predecessor gets a new identity.
+        A predecessor is a trajectory of the last smoothing that is closer than
+        `SAME_MOTION_DISTANCE` and has no heavier successor. Among several, the one with the
+        smallest ratio of distance to weight is chosen. A trajectory without a predecessor gets a
+        new identity.
         """
         numbers = np.zeros(len(found), dtype=np.int64)
         away, before = self._distances(found)
@@ -230,10 +232,10 @@ class SlidingWindow:
         return tuple(int(number) for number in numbers)
 
     def _distances(self, found: TrajectoryMixture) -> tuple[Array, tuple[int, ...]]:
-        """Return distances (M, L) from the last L trajectories, and their identities.
+        """Return distances (M, L) from the last smoothing's L trajectories, and their identities.
 
-        A distance is the mean over the points and the common times, divided by the weight of the
-        last trajectory, and infinite beyond `SAME_MOTION_DISTANCE`.
+        A distance is the mean over points and common times, divided by the weight of the earlier
+        trajectory. It is infinite if the mean exceeds `SAME_MOTION_DISTANCE`.
         """
         last = self._last
         common = 0 if last is None else len({*self.stamps_ns} & {*(last.stamps_ns or ())})

@@ -3,8 +3,8 @@
     q(X) = sum_i a_i N(X; M_i, s_i^2 P_i^-1)
 
 Every component is a Gaussian Markov process with block-tridiagonal precision P_i, so that
-densities, samples and marginals cost O(T) and no (T d, T d) covariance is needed. If the state has
-velocities, they are integrated out of all results.
+densities, samples and marginals cost O(T) and no (T d, T d) covariance is needed. Velocities in the
+state are integrated out of all results.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ class TrajectoryMixture:
         states: (M, T, n) means; the first d of the n variables are the pose.
         factors: M factors of the precisions P_i, without inflation.
         inflation: (M,) s_i, factor on standard deviations.
-        log_joint: (M,) log p(M_i, R) at the means.
+        log_joint: (M,) log p(M_i, R), the log joint density at each mean.
         free_energy: (I,) free energy at each iteration, on the samples of the descent, nats.
         dimension: d, number of variables of a pose.
         stamps_ns: (T,) times, ns; None: unknown.
         final_until_ns: poses at or before this time will not be revised.
-        identities: (M,) number of each motion, from 1 on, the same in all windows; empty if a
-            single window was smoothed.
+        identities: (M,) positive number that identifies each motion in all windows; empty if only
+            one window was smoothed.
         free_energy_fresh: free energy on samples not used in the descent, and its standard error.
         lower, upper: (d,) limits; samples are clipped to them.
         disagreements: (M, T, d, d) covariance between the modes of each motion, added only to the
             marginals. None: components are not motions.
         weights_in_time: (T, M) total probability of the modes near each motion at each time; None:
             `weights` at all times.
-        strays: T mixtures of the modes far from all motions, with their probabilities; they become
-            the last components of the marginals. Empty if missing.
+        strays: T mixtures of the modes that are far from all motions, with the modes' probabilities
+            as weights; they are the last components of the marginals. Empty if missing.
 
     Raises:
         ValueError: shapes are inconsistent, or weights do not sum to 1.
@@ -116,10 +116,10 @@ class TrajectoryMixture:
 
     @cached_property
     def velocities(self) -> Array | None:
-        """Velocities of the poses, (M, T, d) per second; None: unknown.
+        """Velocities of the poses, (M, T, d) per second; None if unknown.
 
-        They are part of the states; if a state is only a pose, they are central differences,
-        one-sided at the ends.
+        Velocities are part of the states. If a state consists of the pose only, velocities are
+        central differences, one-sided at the ends.
         """
         if self.states.shape[2] == 2 * self.dimension:
             return self.states[:, :, self.dimension :]
@@ -159,7 +159,7 @@ class TrajectoryMixture:
         """Log densities log q(X), (n,), of trajectories X (n, T, d).
 
         Raises:
-            ValueError: the trajectories have another shape.
+            ValueError: the trajectories have a wrong shape.
         """
         x = np.asarray(trajectories, dtype=np.float64)
         if x.ndim != 3 or x.shape[1:] != (self.times, self.dimension):
@@ -198,7 +198,7 @@ class TrajectoryMixture:
         return np.asarray(np.einsum('m,mtd->td', self.weights, self.means))
 
     def message_content(self, *, covariances: bool = True) -> dict[str, Any]:
-        """Content of a message, except names and frame (`msg_tools.messages`).
+        """Content of a message without names and frame (`msg_tools.messages`).
 
         Args:
             covariances: whether to compute and include covariances.
@@ -232,9 +232,9 @@ def joined(one: GaussianMixture, other: GaussianMixture) -> GaussianMixture:
 
 
 def weights_capped_by_first(weights: Array) -> Array:
-    """Lower weights (K,) that exceed the first one, without changing their sum.
+    """Limit weights (K,) to at most the first weight, without changing the sum.
 
-    The other weights are cut at a level. Their excess raises the first weight to this level.
+    The other weights are cut at a level; their total excess raises the first weight to it.
     """
     heavier = -np.sort(-weights[1:][weights[1:] > weights[0]])
     levels = (weights[0] + np.cumsum(heavier)) / np.arange(2, len(heavier) + 2)

@@ -7,9 +7,9 @@ is minimised from many starts by damped Newton steps D on the block-tridiagonal 
     minimise    g.D + 1/2 D.(H + lambda W) D    subject to    lower <= x_t <= upper       (5)
 
 where `TrustRegion` adapts lambda. The Hessian of an observation is indefinite between modes. If the
-matrix can not be factorised, the step uses a blend with the positive part of the curvature; if that
-does not descend either, the damping grows. Variables at a limit whose gradient pushes them outwards
-are fixed there; a step that crosses limits is projected onto the box.
+matrix can not be factorised, it is blended with the positive part of the curvature; if the
+resulting step does not descend either, the damping grows. A variable at a limit is fixed if the
+descent would move it outwards; a step that crosses limits is projected onto the box.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
 FIRST_DAMPING = 1e-4
 DAMPING_LIMIT = 1e10
-# Shares of the positive Hessian in a step where the exact Hessian is indefinite.
+# Shares of the positive Hessian in a blend with an indefinite exact Hessian.
 HESSIAN_SHARES = (0.125, 0.25, 0.5, 0.75)
-# Maximum number of doubles in the observation Hessians in memory.
+# Maximum number of values in the observation Hessians that are in memory at a time.
 HESSIAN_BUDGET = 800_000
 
 
@@ -47,7 +47,7 @@ class RefinedTrajectories:
         states: (M, T, n) states at the optima.
         energies: (M,) energies E, nats.
         observation_energies: (M,) the observations' part of E, - sum log p(r_t | x_t), nats.
-        free: (M, T, n) whether a variable is not fixed at a limit.
+        free: (M, T, n) whether each variable is free, not fixed at a limit.
         status: (M,) values of `Status`.
         iterations: (M,) number of evaluations after the first.
         factors: M Cholesky factors of the precision at the optimum. A variable fixed at a limit
@@ -83,8 +83,8 @@ class RefinedTrajectories:
     def without_duplicates(self, distance: float = 0.1) -> RefinedTrajectories:
         """Return distinct optima, the most probable first.
 
-        Two optima are the same if their energies, in nats, and their states, in standard deviations
-        of the more probable optimum, differ by less than `distance`.
+        Two optima are the same if they differ by less than `distance` both in energy, in nats, and
+        in states, in standard deviations of the more probable optimum.
         """
         order = np.argsort(self.energies, kind='stable')
         kept: list[int] = []
@@ -189,7 +189,8 @@ class _Problem:
             self.states[rows] = trial[better]
             for name, value in zip(('energy', 'observed', 'gradient', 'hessian'), found):
                 getattr(self, name)[rows] = value[better]
-            # First use the positive part of the curvature, then increase the damping.
+            # After a refused step, first use the positive part of the curvature, then increase the
+            # damping.
             refused = active[~better]
             damped = refused[~self.exact[refused]]
             self.exact[rows], self.exact[refused] = True, False
@@ -200,7 +201,8 @@ class _Problem:
         """Return the optima; `offset` is the index of the first start."""
         everyone = np.arange(len(self.states))
         held = resting(self.states, self.gradient, self.low, self.high)
-        # The density beyond a limit is zero and falls off inside as exp(-g distance).
+        # The density is 0 beyond a limit and decreases with distance from the limit as exp(-g
+        # distance).
         slope = np.where(held, self.gradient, 0.0) ** 2
         factors = [self._factor(self.hessian[i], slope[i]) for i in everyone]
         failed = np.array([i for i in everyone if factors[i] is None], dtype=np.intp)
@@ -222,7 +224,7 @@ class _Problem:
     def _evaluate(
         self, states: Array, derivatives: Derivatives
     ) -> tuple[Array, Array, Array, Array]:
-        """Return energy, observation energy, gradient (M, T, n) and Hessians (M, T, d, d)."""
+        """Return energies, observation energies, gradients (M, T, n) and Hessians (M, T, d, d)."""
         m, d = len(states), self.prior.dimension
         at = np.tile(np.arange(self.times), m)
         poses = states[:, :, :d].reshape(-1, d)
@@ -252,8 +254,8 @@ class _Problem:
             positive = self._evaluate(self.states[active[failed]], Derivatives.POSITIVE)[3]
             for row, hessian in zip(failed, positive):
                 i = active[row]
-                # Blend an indefinite Hessian with the smallest share of the positive one that makes
-                # the sum positive definite.
+                # Blend an indefinite Hessian with the smallest share of the positive Hessian that
+                # makes the blend positive definite.
                 if self.exact[i] and any(
                     self._step(
                         i,
@@ -309,7 +311,7 @@ class _Problem:
             return None
 
     def _positive_factor(self, hessian: Array, extra: Array) -> BlockCholesky:
-        """Factorise as `_factor`, with a shift that makes the matrix positive definite."""
+        """Factorise the same matrix as `_factor`, shifted until it is positive definite."""
         shift = 0.0
         while True:
             factor = self._factor(hessian, extra + shift * self._metric(hessian))
@@ -321,10 +323,10 @@ class _Problem:
 def limits_of_states(
     lower: ArrayLike, upper: ArrayLike, dimension: int, size: int
 ) -> tuple[Array, Array]:
-    """Extend limits (d,) of the poses to limits (n,) of the states, without limits of velocities.
+    """Extend limits (d,) of poses to limits (n,) of states, in which velocities are unlimited.
 
     Raises:
-        ValueError: limits have the wrong dimension, or a lower limit is above the upper one.
+        ValueError: limits have the wrong dimension, or a lower limit exceeds the upper limit.
     """
     low, high = np.full((2, size), [[-np.inf], [np.inf]])
     for name, limits, given in (('lower', low, lower), ('upper', high, upper)):

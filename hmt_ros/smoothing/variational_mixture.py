@@ -1,4 +1,4 @@
-"""The mixture over trajectories that is closest to the posterior (VMS 6, with its numbers).
+"""The mixture over trajectories that is closest to the posterior (VMS 6, with the numbers there).
 
     q(X) = sum_i a_i N(X; M_i, s_i^2 S_i)
 
@@ -11,13 +11,13 @@ expectation is over samples
 
     X = M_i + s_i L_i'^-1 z
 
-with the same antithetic noise z throughout, so that the sampled F is smooth, its gradients are
-exact and its descent is repeatable. The reported F uses fresh samples and has a standard error.
-Variables are scaled by the curvature that F would have if the posterior were q: means by L_i
-sqrt(a_i), log s_i by sqrt(2 D a_i).
+with the same antithetic noise z throughout. The sampled F is therefore smooth, its gradients are
+exact, and its descent is repeatable. The reported F uses fresh samples and has a standard error.
+Variables are scaled by the curvature of F for a posterior equal to q: means by L_i sqrt(a_i), log
+s_i by sqrt(2 D a_i).
 
-Most components are far from each other, and such pairs are skipped. The expected responsibility of
-j for samples of i is at most
+Most pairs of components are far apart and are skipped. The expected responsibility of j for samples
+of i is at most
 
     E_i[a_j q_j / (a_i q_i + a_j q_j)] <= (a_j / a_i)^(1/2) / 2 int (q_i q_j)^(1/2)
 
@@ -48,12 +48,12 @@ from hmt_ros.inference.threads import together
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
 ADAPTED_PARAMETERS = ('weights', 'means', 'inflation')
-# Number of parts into which components are split; fixed, so that sums keep their order.
+# Number of parts into which components are split; it is fixed so that sums keep their order.
 PART_COUNT = 4
 # Maximum number of successive iterations without a gain on held-out samples.
 MAX_IDLE_ITERATIONS = 3
-HISTORY_LENGTH = 8  # number of past steps in L-BFGS
-# Minimum proportion for the scale of a component's variables.
+HISTORY_LENGTH = 8  # number of stored steps in L-BFGS
+# Lower bound on the proportion in the scale of a component's variables.
 MIN_WEIGHT = 1e-4
 # Minus the logarithm of a negligible overlap.
 NEGLIGIBLE_OVERLAP = 30.0
@@ -69,8 +69,9 @@ class VariationalMixture:
         inflation: (M,) factors s_i on standard deviations.
         free_energy: (I,) F at the start and after each iteration, on the samples of the descent,
             nats.
-        held_out: (J,) F on the held-out samples that select the iterate, nats; J >= I, because the
-            descent continues for some iterations after the best one. Empty without a descent.
+        held_out: (J,) F at each iteration on the held-out samples that select the best iterate,
+            nats; J >= I, because the descent continues for some iterations after the best. Empty
+            without a descent.
         fresh: F on unused samples, and its standard error, nats.
     """
 
@@ -83,7 +84,7 @@ class VariationalMixture:
 
 
 def laplace_masses(energies: Array, factors: Sequence[BlockCholesky]) -> Array:
-    """Return logs (M,) of the integrals of p(X, R) around optima, by Laplace's approximation."""
+    """Return the log integrals (M,) of p(X, R) around optima, by Laplace's approximation."""
     size = factors[0].times * factors[0].size
     determinants = np.array([factor.log_determinant for factor in factors])
     return np.asarray(-energies - 0.5 * determinants + 0.5 * size * elementary.log(2 * np.pi))
@@ -109,7 +110,7 @@ def minimise_free_energy(
     Args:
         weights: (M,) proportions.
         states: (M, T, n) means.
-        adapt: names of the adapted variables, some of `ADAPTED_PARAMETERS`.
+        adapt: names of the adapted variables, a subset of `ADAPTED_PARAMETERS`.
         low, high: (n,) limits of the means.
         samples: number of samples per component, even.
         max_iterations: maximum number of L-BFGS iterations; 0 evaluates only.
@@ -134,7 +135,7 @@ def minimise_free_energy(
     mixture = objective.mixture(x)
     a, means, inflation = mixture
     each = objective.sampled(mixture, fresh)
-    # Antithetic pairs are one observation each.
+    # Each antithetic pair counts as one observation.
     pairs = each.reshape(len(a), -1, 2).mean(2)
     error = np.nan
     if pairs.shape[1] > 1:
@@ -156,9 +157,9 @@ def antithetic(rng: np.random.Generator, components: int, samples: int, size: in
 
 
 def matched(noise: Array) -> Array:
-    """Scale noise (M, S, D) to unit variance in each component.
+    """Scale noise (M, S, D) so that its variance is 1 in each component.
 
-    With few samples the inflation would otherwise follow the chance variance of the noise.
+    With few samples the inflation would otherwise adapt to the random variance of the noise.
     """
     return np.asarray(noise / np.sqrt((noise * noise).mean((1, 2), keepdims=True)))
 
@@ -166,10 +167,10 @@ def matched(noise: Array) -> Array:
 def _descend(
     objective: FreeEnergy, choice: Array, max_iterations: int, tolerance: float
 ) -> tuple[Array, Array, Array]:
-    """Run L-BFGS from 0; return the best iterate, F up to it, and F on held-out samples.
+    """Run L-BFGS from 0; return the best iterate, F until then, and F on held-out samples.
 
-    With few samples the descent fits their noise. Therefore the iterate with the least F on
-    held-out samples is kept, and the descent ends when F on these samples no longer falls.
+    With few samples the descent would overfit. The iterate with the least F on held-out samples is
+    kept, and the descent ends when F on these samples no longer falls.
     """
     best = start = np.zeros(objective.parameters)
     first = objective(start)
@@ -274,7 +275,7 @@ class FreeEnergy:
         return self._evaluate(mixture, noise, self._coloured(noise), derivatives=False)[0]
 
     def __call__(self, x: Array) -> tuple[float, Array]:
-        """F and its gradient."""
+        """Compute F and its gradient."""
         mixture = self.mixture(x)
         weights, means, inflation = mixture
         each, slope, parts = self._evaluate(mixture, self.noise, self.roots)
@@ -357,7 +358,7 @@ class FreeEnergy:
         return value + found.value.reshape(s, self.times).sum(1), gradient
 
     def _near(self, means: Array, inflation: Array) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-        """Return (M, M) whether components may overlap at the time at which they differ most.
+        """Return (M, M) whether two components can overlap at the time at which they differ most.
 
         Also return the index of this time, (M, M).
         """

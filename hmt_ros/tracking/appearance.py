@@ -4,8 +4,9 @@
     area     area of the largest piece of the foreground that has the shape of one person / usual
 
 If the clothes have the colours of the room, only a part of the model is foreground, so the share is
-compared with that of earlier images of the track. A person unseen for a time t may be RUNNING_SPEED
-t further away; the usual area shrinks accordingly. For colours see `image.person_colours`.
+compared with the share in earlier images of the track. A person who was not seen for a time t may
+be RUNNING_SPEED t further away, so the usual area is reduced accordingly. For colours see
+`image.person_colours`.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class Silhouetted(NamedTuple):
 
     @property
     def evidence(self) -> float:
-        """Larger evidence of place and area: a model in a wrong pose is not an absent person."""
+        """Larger of the two, because a model in a wrong pose does not mean that nobody is there."""
         return max(self.by_place, self.by_area)
 
 
@@ -73,14 +74,14 @@ class Appearance:
         self._piece: Piece | None = None
 
     def uncovered_share(self, others: Mask | None) -> float:
-        """Share of the model's last area in the image that other people (H, W) do not cover."""
+        """Share of the model's last image area outside the pixels (H, W) of other people."""
         if self._model is None or others is None:
             return 1.0
         hidden = counted(self._model & on_raster(others, self._model))
         return 1.0 - hidden / max(counted(self._model), 1)
 
     def unseen(self, stamp: int) -> float:
-        """Time since the person was last seen, s, at a timestamp, ns; 0 if never seen."""
+        """Time from the last sighting to a timestamp, ns, in seconds; 0 if never seen."""
         return 0.0 if self._model is None else seconds(stamp - self._stamp)
 
     def silhouetted(self, view: View, stamp: int) -> Silhouetted | None:
@@ -98,7 +99,7 @@ class Appearance:
             return None
         foreground, others = view.anywhere, view.others
         if others is not None and view.silhouette is not None:
-            # Other people may be in view, so only foreground near the person counts.
+            # Other people may be in view, so only foreground near the person is used.
             foreground = on_raster(view.silhouette, foreground)
             model = model & ~on_raster(others, model)
         self._foreground = foreground
@@ -114,7 +115,7 @@ class Appearance:
         )
 
     def colour_evidence(self, view: View) -> tuple[bool, float] | None:
-        """Whether colours are evidence for the person, and its weight, 0 to 1; None if unknown.
+        """Whether colours support a person in view, and their weight, 0 to 1; None if unknown.
 
         Evidence against a person has weight 0 if the scene has changed since the colours were
         learned.
@@ -138,7 +139,7 @@ class Appearance:
     def is_apart(self, view: View, stamp: int) -> bool:
         """Whether most keypoints are outside the model's box, but within the person's reach.
 
-        Keypoints beyond that reach are an error of the detector, or another person.
+        Keypoints beyond that reach are a detection error, or belong to another person.
         """
         keypoints = view.keypoints
         if keypoints is None or self._model is None or not keypoints.seen.any():
@@ -151,7 +152,7 @@ class Appearance:
         return bool(0.25 * max(width, height) < np.median(away) < way)
 
     def learn(self, view: View, stamp: int, body: Body, camera: Camera, pose: Array) -> None:
-        """Learns the appearance from an image and a pose (d,); requires a call of `silhouetted`."""
+        """Learns the appearance from an image and a pose (d,); call `silhouetted` first."""
         dt = 0.0 if self._model is None else seconds(stamp - self._stamp)
         gain = -float(elementary.expm1(-dt / MEMORY_TIME))
         self._model = model = covered(body, camera, pose, raster_step(camera.height))

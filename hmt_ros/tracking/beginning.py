@@ -1,4 +1,4 @@
-"""Start of a track: a table of possible sources, of which the first available one is used.
+"""Start of a track, from the first available source in a table.
 
     source        needs                                             sure (nats, plus existence)
     subject       a subject file, and an image at or after it       given
@@ -14,8 +14,8 @@ A track starts once
     log odds of existence + sure + log p(distance) >= log odds of PRESENT_PROBABILITY
 
 p(distance) is log-normal and wide, without a limit: a lens of 60 degrees sees people at 0.4 to 15
-m, and these distances grow with the focal length. After the end of a track, a silhouette in front
-of a known scene suffices, too.
+m, and these distances grow with the focal length. After a track has ended, a silhouette in front of
+a known background also suffices.
 
 Keypoints give poses, depth and lengths (see `initialisation`); a mask or a box gives mean poses at
 several headings. A detector may confuse left and right, and silhouettes do not distinguish sides.
@@ -62,7 +62,7 @@ from hmt_ros.tracking.initialisation import (
 from hmt_ros.tracking.observer import View
 from hmt_ros.tracking.settings import MAX_STARTS, PRESENT_PROBABILITY, SAME_MOMENT_TIME
 
-# Log odds of existence from a prediction, nats: a first image may have no other evidence.
+# Log odds of existence that a prediction adds, nats; the first image may have no other evidence.
 PREDICTION_LOG_ODDS = 1.5 * CLEAR_CUE.nats
 PRESENT_LOG_ODDS = float(elementary.log(PRESENT_PROBABILITY / (1.0 - PRESENT_PROBABILITY)))
 # Number of keypoint poses, best first, whose depth reversals become hypotheses too.
@@ -81,7 +81,7 @@ class Source(Enum):
     ARRIVAL = 'who has come into view'
 
 
-# Sources whose best pose is near the person, and sources possibly based on silhouettes alone.
+# Sources that contain joints, and sources that may use only a silhouette.
 JOINT_SOURCES = (Source.SUBJECT, Source.KEYPOINTS)
 SILHOUETTE_SOURCES = (Source.PREDICTION, Source.ARRIVAL)
 
@@ -92,12 +92,12 @@ class Shown:
 
     Attributes:
         view: view of the image.
-        model: body of an average person; a subject's lengths replace its own.
+        model: body of an average person, before a subject's lengths are applied.
         body: body for the poses of a given mixture.
         camera: camera that sees the person.
         upright: gravity; None: unknown.
-        given: subject or mixture from which the track starts; None: images start the track.
-        box: (left, top, right, bottom) of the person, px; None: unknown.
+        given: subject or mixture from which the track starts; None: the track starts from an image.
+        box: bounding box (left, top, right, bottom) of the person, px; None: unknown.
     """
 
     view: View
@@ -179,8 +179,8 @@ def _masked(shown: Shown) -> bool:
     return mask is not None and silhouette is not None and looks_like_person(silhouette)
 
 
-# Each row: the source; a test for its inputs; `sure`, its log odds of existence, nats, infinite for
-# a given start; a function that returns the start, or None if it is impossible.
+# Columns: source; test for its inputs; `sure`, the log odds of existence that it adds, nats
+# (infinite for a given start); function that returns the start, or None if impossible.
 STARTS: tuple[
     tuple[Source, Callable[[Shown], bool], float, Callable[[Shown], Start | None]], ...
 ] = (
@@ -212,7 +212,7 @@ STARTS: tuple[
 
 
 def first_start(shown: Shown, existence: Existence) -> tuple[Source, Start] | None:
-    """Returns the source and the start of a track in an image; None if no track starts."""
+    """Returns the first available source and its start; None if no track starts in the image."""
     awaited = shown.given is not None and shown.box is None
     usable = (
         (source, sure, begin)
@@ -252,11 +252,11 @@ def poses_to_search(
     prediction: PosePrediction | None,
     upright: Gravity | None,
 ) -> Array | None:
-    """Poses (N, d) of a person from one image alone, or None.
+    """Poses (N, d) of a person from one image alone; None if it contains no usable input.
 
     The lengths and flesh of the body are fixed. Keypoints give all poses that explain them. Without
-    keypoints, a silhouette gives mean poses at several headings, at its place. Predicted poses are
-    added.
+    keypoints, mean poses with several headings are placed at the silhouette. Poses of a predictor
+    are added.
     """
     found = []
     keypoints, depths = observation.keypoints, observation.evidence.get(DEPTH.name)
@@ -273,7 +273,7 @@ def poses_to_search(
 
 
 def with_reversals(body: Body, poses: Array) -> Array:
-    """Poses (N, d), best first, followed by the depth reversals of the best.
+    """Appends depth reversals of the best poses to poses (N, d), which are sorted best first.
 
     A reversed pose explains the same keypoints if the detector has exchanged left and right.
     """

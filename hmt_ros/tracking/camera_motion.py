@@ -3,9 +3,9 @@
     p' = R p + t                     a fixed point in the camera frames of two images, m
     R = C'^T C,  t = C'^T (c - c')   from poses of the camera, p_fixed = C p + c
 
-A mixture over poses is in the camera frame. Before prediction it is transformed from the camera
-frame of the last image to that of the present image, so that velocities and predictions are
-relative to the fixed frame. With the angular velocity w = A(a) da/dt of the root's angles a,
+A mixture over poses is in the camera frame. Before prediction it is transformed from the previous
+camera frame to the present camera frame, so that velocities and predictions are relative to the
+fixed frame. With the angular velocity w = A(a) da/dt of the root's angles a,
 
     place' = R place + t,   Q(a') = R Q(a),   da' = A(a')^-1 R A(a) da
 
@@ -31,7 +31,7 @@ from hmt_ros.tracking.settings import MAX_EXTRAPOLATION_TIME
 
 @dataclass(frozen=True, eq=False)
 class CameraMotion:
-    """Transform from the camera frame of one image to that of another: p' = R p + t.
+    """Transform between the camera frames of two images: p' = R p + t.
 
     Attributes:
         rotation: rotation R (3, 3).
@@ -43,7 +43,7 @@ class CameraMotion:
 
     @classmethod
     def between(cls, before: CameraPose, now: CameraPose) -> CameraMotion | None:
-        """Motion from one pose of the camera to another; None if the poses are equal."""
+        """Motion between two poses of the camera; None if the poses are equal."""
         if before.equals(now):
             return None
         back = now.rotation.T
@@ -70,8 +70,8 @@ class CameraMotion:
         Args:
             body: body of the poses.
             poses: (N, d) poses.
-            turn: approximate rotation of the root about z, rad, which selects the whole turns of
-                the result in a chain of motions.
+            turn: approximate rotation of the root about z, rad, which determines the whole turns in
+                the resulting angle.
             to: body with the level of the result; None: the level is unchanged.
         """
         offset = body.skeleton.offsets[0]
@@ -109,7 +109,7 @@ class CameraMotion:
 
 
 class CameraPath:
-    """Poses of the camera at the images, given for most images.
+    """Path of the camera, from poses that are given for most images.
 
     For an image without a pose, the motion between the last two given poses is extrapolated for at
     most `MAX_EXTRAPOLATION_TIME`; after that the motion is unknown until the next given pose. A
@@ -125,7 +125,7 @@ class CameraPath:
         self._last_stamp = 0
 
     def advance(self, stamp: int, pose: CameraPose | None) -> CameraMotion | None:
-        """Advances to the next image; returns the motion since the last, None if zero or unknown.
+        """Advances to the next image; returns the motion in between, None if zero or unknown.
 
         Args:
             stamp: timestamp of the image, ns.

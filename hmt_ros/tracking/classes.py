@@ -8,18 +8,18 @@ Facing direction of the person: a two-state chain, which uses all images of the 
     b(d) = log (v e^d + 1 - v) - log (v + (1 - v) e^d)                                          (3)
 
 A camera hardly distinguishes a pose from its reversal in depth (`body.mirror`), and small steps do
-not correct a wrong one. S = logit p are the log odds that the person faces the other way than the
-heaviest mode, Q the rates of the symmetry `reversal` (`body.body`), e_k the energy of an image at
-mode k. Nobody turns round from one image to the next: a hypothesis that faces the other way is
-another history of the track. It is weighed with the evidence of all images so far for that history,
-even if none of its modes was kept. In a side view the two histories join (1): t is the transition
-density of the joints (`weighting`), h the transition density of the heading, which diffuses at the
-rate of the body. The best mode represents its facing direction (2), because neither the number of
-modes nor a jumped mode is evidence for it. An image shows the facing direction with the probability
-v, otherwise something unrelated, such as a flash or a covered lens (3): no single image reverses a
-track. A mode stores the log odds of its own facing direction: -S, or S if it faces the other way
-than the heaviest. For the ancestry of the modes, the transition density between poses of opposite
-facing directions is
+not correct a wrong facing direction. S = logit p are the log odds that the person faces opposite to
+the heaviest mode, Q the rates of the symmetry `reversal` (`body.body`), e_k the energy of an image
+at mode k. Nobody turns round between two images, so a hypothesis that faces the other way belongs
+to another history of the track. Its weight includes the evidence of all images so far for that
+history, even if no mode of that history was kept. In a side view the two histories join (1): t is
+the transition density of the joints (`weighting`), h the transition density of the heading, which
+diffuses at the rate of the body. The best mode represents its facing direction (2), because neither
+the number of modes nor a jumped mode is evidence for it. An image shows the facing direction with
+the probability v, otherwise something unrelated, such as a flash or a covered lens (3): no single
+image reverses a track. A mode stores the log odds of its own facing direction: -S, or S if it faces
+opposite to the heaviest mode. For the ancestry of the modes, the transition density between poses
+of opposite facing directions is
 
     log t(x_k, x_j) = log (exp min(log t, log h) + [exp(Q dt)]_ww')                             (6)
 
@@ -63,14 +63,14 @@ class FacingInputs(NamedTuple):
     """Inputs for the compiled function that weighs hypotheses of both facing directions.
 
     Attributes:
-        before: (K,) whether each mode faces opposite to the heaviest.
+        before: (K,) whether each mode faces opposite to the heaviest mode.
         back: (N,) whether each hypothesis faces opposite to the heaviest mode.
         variance: variance of the turn since the previous image, rad^2.
         log_odds: log odds of the other facing direction, predicted by the chain.
         price: -log of the probability of a change of facing direction since the previous image,
             nats.
         valid: probability v that an image shows the facing direction.
-        most: bound on the size of the log odds.
+        most: maximum absolute value of the log odds.
     """
 
     before: Mask
@@ -83,7 +83,7 @@ class FacingInputs(NamedTuple):
 
 
 def ways(body: Body, joints: Array, reference: Array) -> Mask:
-    """Whether poses, joints (N, J, 3), face the other way than a reference, joints (J, 3).
+    """Whether poses with joints (N, J, 3) face opposite to a reference with joints (J, 3).
 
     All False for a body without a trunk.
     """
@@ -105,7 +105,7 @@ def lost_a_facing(back: Mask, log_weights: Array) -> bool:
     """Whether one of the two facing directions has no mode of comparable weight.
 
     Args:
-        back: (K,) whether each mode faces opposite to the heaviest.
+        back: (K,) whether each mode faces opposite to the heaviest mode.
         log_weights: (K,) log weights of the modes in the image.
     """
     one_way = not back.any() or back.all()
@@ -121,7 +121,7 @@ def best_of_other_facing(body: Body, joints: Array, log_weights: Array, least: f
     Args:
         body: body of the poses.
         joints, log_weights: joints (N, J, 3) and log weights (N,) of the poses.
-        least: log weight relative to the heaviest below which a weight counts as 0.
+        least: log weight, relative to the heaviest pose, below which a pose is ignored.
     """
     best = int(np.argmax(log_weights))
     back = np.flatnonzero(ways(body, joints, joints[best]))
@@ -138,20 +138,20 @@ def weigh_ways(
     evidence: Array,
     followed: Mask,
 ) -> tuple[Array, Array, Array]:
-    """Log weights (N,) of poses such that each facing direction has its history's weight.
+    """Log weights (N,) of poses in which each facing direction has the weight of its history.
 
     Args:
         modes: K modes of the previous image.
         transition_prior: transition densities to the image, with the predicted poses of the modes.
         joints: (N, J, 3) joints of the poses, m.
         transitions: (K, N) log transition densities t(x_n, x_k) from the modes.
-        log_weights: (N,) log weights, of which only ratios within a facing direction are used.
+        log_weights: (N,) log weights; only their differences within a facing direction are used.
         evidence: (N,) energies of the image at the poses, nats.
         followed: (N,) False for poses that jumped in all degrees of freedom.
 
     Returns:
-        The log weights, the log odds (N,) of each pose's facing direction, and the term (K, N) that
-        (6) adds to log t.
+        The log weights, the log odds (N,) of each pose's facing direction, and the term (K, N) to
+        add to log t according to (6).
     """
     body, dt = transition_prior.body, transition_prior.dt
     log_odds = -float(modes.facing[0])
@@ -181,26 +181,26 @@ def weigh_ways(
 
 
 def predicted_exchanges(exchanges: Array, dt: float) -> Array:
-    """Log probabilities (K, E) of exchanged sides dt seconds later, (4)."""
+    """Predicts log probabilities (K, E) of exchanged sides dt seconds ahead, equation (4)."""
     p = EXCHANGE_CHAIN.predict(elementary.exp(exchanges), dt)
     return np.asarray(elementary.log(np.maximum(p, MIN_EXCHANGE_PROBABILITY)), dtype=np.float64)
 
 
 def known_exchanges(exchanges: Array) -> Array:
-    """Replaces unknown log probabilities (N, E) of exchanged sides with the usual ones."""
+    """Replaces unknown log probabilities (N, E) of exchanged sides with their usual values."""
     return np.where(np.isnan(exchanges), usual_exchanges(), exchanges)
 
 
 def seen_exchanges(
     likelihood: ImageLikelihood, observation: Observation, poses: Array, exchanges: Array
 ) -> Array:
-    """Log probabilities (K, E) of exchanged sides given an image, (5).
+    """Log probabilities (K, E) of exchanged sides given an image, equation (5).
 
     Args:
         likelihood: likelihood of the body.
         observation: observation of the image; without keypoints, `exchanges` is returned.
         poses: (K, d) poses of the modes.
-        exchanges: (K, E) log probabilities of exchanged sides, before the image.
+        exchanges: (K, E) log probabilities of exchanged sides, given earlier images.
     """
     if observation.keypoints is None or likelihood.settings.keypoints.weight == 0:
         return exchanges

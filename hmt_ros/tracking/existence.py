@@ -8,8 +8,8 @@
 This is the existence probability of integrated probabilistic data association (Musicki, Evans and
 Stankovic, "Integrated probabilistic data association", 1994) and of the Bernoulli filter (Ristic et
 al., "A tutorial on Bernoulli filters", 2013, equations 28 and 56), with rates per second in place
-of probabilities per scan. llr_g is the log likelihood ratio of somebody against nobody for cue g in
-the whole image, and a_g its remaining share, because its errors persist (`error_model`).
+of probabilities per scan. llr_g is the log likelihood ratio of a person against nobody in view, for
+cue g in the whole image, and a_g discounts it, because the errors of a cue persist (`error_model`).
 
     silhouette   m = max(share of the model on it / usual share, area of its largest piece that has
                  the shape of a person / usual area), in the whole image
@@ -19,16 +19,16 @@ the whole image, and a_g its remaining share, because its errors persist (`error
     colours      whether the person's colours are anywhere; only if nothing else shows a person, and
                  against a person only in the scene where they were learned
 
-Before a track, keypoints of unchanged images count once: a detector that confuses the foot of a
-table with a person does so in every such image. People always move a little.
+Before a track starts, keypoints of unchanged images are used once: a detector that confuses the
+foot of a table with a person does so in every such image. People always move a little.
 
-If nothing has moved, a person who was in view still is, so the prediction is skipped.
+If nothing has moved, a person who was in view is still there, so the prediction is skipped.
 
 An image that has mostly changed is no evidence: a covered lens, a flash, noise. If the camera has
-moved, missing colours are no evidence against a person: they may have been those of an object. If
-others hide the person, only evidence for the person counts. So only an image of the empty place
-ends a track: without such an image r tends to b / (b + l), far above `ABSENT_PROBABILITY`, with the
-rates b of entering and l of leaving the view.
+moved, missing colours are no evidence against a person, because they may have belonged to an
+object. If other people hide the person, only evidence for the person is used. So only an image of
+the empty place ends a track: without such an image r tends to b / (b + l), far above
+`ABSENT_PROBABILITY`, with the rates b of entering and l of leaving the view.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Cue(NamedTuple):
     """Weight of a cue.
 
     Attributes:
-        nats: largest log likelihood ratio of somebody against nobody.
+        nats: largest log likelihood ratio of a person against nobody in view.
         tau: correlation time of the errors of the cue, s.
     """
 
@@ -86,8 +86,8 @@ class Cue(NamedTuple):
 
 CLEAR_CUE, DOUBTFUL_CUE = (Cue(*EXISTENCE_CUES[name]) for name in ('clear', 'doubtful'))
 
-# Probability of existence before the first image, as after one clear image of nobody, and at a
-# given start, as after one clear image of a person.
+# Probabilities of existence: before the first image (as after a clear image without a person), and
+# at a given start (as after a clear image of a person).
 INITIAL_PROBABILITY, GIVEN_PROBABILITY = of_log_odds([-CLEAR_CUE.nats, CLEAR_CUE.nats])[
     :, 1
 ].tolist()
@@ -100,12 +100,13 @@ class Sighting(NamedTuple):
         log_ratios: log likelihood ratio of each cue, nats; positive for a person in view.
         seen: whether the person can be tracked in the image: a cue shows a person, or the image is
             usable and no cue is evidence against a person.
-        blank: whether modes cannot be fitted to the image, because others hide most of the person,
-            or the silhouette shows nobody.
+        blank: whether modes cannot be fitted to the image, because other people hide most of the
+            person, or the silhouette shows nobody.
         hidden: whether other people hide most of the person.
-        elsewhere: whether the track must search, because the image shows a person away from all
-            modes, or after so long a time that the modes are useless.
-        still_in_view: whether the image shows the person, or is unchanged since an image that did.
+        elsewhere: whether the person must be searched for, because the image shows a person away
+            from all modes, or too long after the last sighting for the modes to be useful.
+        still_in_view: whether the image shows the person, or is unchanged since an image that
+            showed the person.
     """
 
     log_ratios: Mapping[str, float] = MappingProxyType({})
@@ -138,7 +139,7 @@ class Existence:
         self.last = Sighting()
         self.last_evidence: dict[str, int] = {}
         self.appearance = Appearance()
-        self._stamps: tuple[int, int] | None = None  # first and last image, ns
+        self._stamps: tuple[int, int] | None = None  # timestamps of first and last image, ns
         self._still = StillPicture()
 
     @property
@@ -159,7 +160,7 @@ class Existence:
 
     @property
     def nobody(self) -> bool:
-        """Whether nobody is in view, and the last image was evidence of that."""
+        """Whether nobody is probably in view, and the last image was evidence for this."""
         return self.probability < ABSENT_PROBABILITY and self.last.llr < 0.0
 
     def update(self, view: View, body: Body, *, waiting: bool = False) -> None:
@@ -171,7 +172,7 @@ class Existence:
             waiting: whether no track has started yet.
         """
         stamp = view.stamp
-        # Motion is used only without another cue.
+        # Motion is used only if there is no other cue.
         alone = view.anywhere is None and view.keypoints is None and not waiting
         motion = self.appearance.motion(view) if alone else NO_MOTION
         still = motion.still and self.last.still_in_view
@@ -212,11 +213,11 @@ class Existence:
         self._stamps = stamp if self._stamps is None else self._stamps[0], stamp
 
     def _cues(self, view: View, body: Body) -> tuple[dict[str, tuple[float, Cue]], bool, bool]:
-        """Evaluates the cues: -1 is nobody, 1 is a person.
+        """Evaluates the cues, each from -1 (nobody) to 1 (a person).
 
         Returns:
-            Value and weight of each informative cue; whether the image is usable, which it is
-            without silhouettes too; whether it shows a person away from the model.
+            Value and weight of each informative cue; whether the image is usable, always true
+            without silhouettes; whether the image shows a person away from the model.
         """
         cues, apart = {}, False
         usable = view.anywhere is None

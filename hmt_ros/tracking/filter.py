@@ -74,7 +74,7 @@ class CueMisfits(NamedTuple):
     """Misfits of the modes to the cues of an image.
 
     Attributes:
-        misfits: misfits by name of the cue, and that of the silhouette's outline.
+        by_cue: misfits by cue name, including the silhouette's outline.
         alone: pose fitted to keypoints alone; None: not needed.
     """
 
@@ -134,7 +134,7 @@ class MixtureFilter:
 
     @property
     def person(self) -> Body:
-        """Body with larger standard deviations of the joints of unseen limbs."""
+        """Body in which the joints of unseen limbs have larger standard deviations."""
         return self.limbs.with_larger_errors(self.body)
 
     # The start.
@@ -252,7 +252,7 @@ class MixtureFilter:
         """Weighs distinct hypotheses; returns the first five arguments of `_select`."""
         optimised = _finite(optimised)
         evidence = search.evidence(optimised)
-        # Of equal hypotheses, those without a jump precede those that jumped.
+        # If two hypotheses are equal, the one without a jump comes first.
         followed = np.asarray(~optimised.hypotheses.jumped.any(1))
         order = np.lexsort((evidence, ~followed))
         joints = self.body.joint_positions(optimised.minima.x)
@@ -342,7 +342,7 @@ class MixtureFilter:
             self._points = seen_points(posterior.body, self.camera, frames, observation.others)
 
     def _publish(self, modes: Modes) -> None:
-        """Sets the published modes, and their origins in the previous image."""
+        """Sets the published modes, and the probabilities of their origins."""
         before, self._sources = self._sources, np.arange(len(modes))
         weights = elementary.exp(self.published.log_weights)
         unseen = self.limbs.of_dofs(self.body)
@@ -391,7 +391,7 @@ class MixtureFilter:
         return CueMisfits(found, alone)
 
     def _fit_shape(self, observation: Observation, image_share: float) -> bool:
-        """Updates the shape from an image; returns False if the image has no evidence of it."""
+        """Updates the shape from an image; returns whether the image was used."""
         if not self.settings.estimate_shape:
             return False
         if observation.outline is None and observation.keypoints is None:
@@ -414,7 +414,7 @@ class MixtureFilter:
         return True
 
     def _replace_body(self, body: Body) -> None:
-        """Replaces the body by another one with the same degrees of freedom."""
+        """Replaces the body by a body with the same degrees of freedom."""
         self.body = body
         self.dynamics = dynamics_of(body, self.settings.motion)
         self.posterior = Posterior(

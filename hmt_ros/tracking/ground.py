@@ -1,4 +1,4 @@
-"""The ground: which way is up, and how far the floor lies below the camera.
+"""The ground: vertical direction, and height of the camera above the floor.
 
     h(p) = n . p + d        height of a point p over the floor, camera frame, m
 
@@ -121,15 +121,16 @@ class GroundEstimator:
     The floor is a high quantile of the distance of the lowest sole below the camera in the last
     seconds, because people mostly stand on the floor, and sometimes jump. The lines of the scene
     (`image.vertical_lines`) refine a given vertical. Without a given vertical, the lines determine
-    it. Without lines, it is estimated near the vertical of the image from the axis of a standing
-    body, which leads from the middle of the feet to the centre of mass. Errors of the axis persist,
-    so one image per `VERTICAL_TIME` counts, and the standard deviation is at least `AXIS_SIGMA`.
+    it. Without lines, the vertical is estimated near the vertical of the image, from the axis of a
+    standing body (from the middle of the feet to the centre of mass). Errors of the axis persist,
+    so all images within `VERTICAL_TIME` count as one, and the standard deviation is at least
+    `AXIS_SIGMA`.
 
-    A given vertical is doubted if the lines show another one, or if the person would be lying down.
-    It may have the wrong sign, as from an accelerometer at rest. Its opposite is used if keypoints
-    show the person head down: from the first image if the given vertical points down in the image,
-    otherwise after `HEAD_DOWN_IMAGES` images. If the vertical of the lines jumps, the next look at
-    the lines must confirm it.
+    A given vertical is doubted if the lines show a different vertical, or if the person would be
+    lying down. It may have the wrong sign, as from an accelerometer at rest. The opposite vertical
+    is used if keypoints show the person head down: from the first image if the given vertical
+    points down in the image, otherwise after `HEAD_DOWN_IMAGES` images. If the vertical from the
+    lines jumps, the next evaluation of lines must confirm the change.
 
     Args:
         known: prior knowledge of gravity and floor; None: unknown.
@@ -255,7 +256,7 @@ class GroundEstimator:
 
     @property
     def vertical_known(self) -> bool:
-        """Whether the vertical is given or shown by lines of the scene, rather than guessed."""
+        """Whether the vertical is given, or known from lines of the scene."""
         return self.known.up is not None or self._seen is not None
 
     @property
@@ -264,7 +265,7 @@ class GroundEstimator:
         return self.estimate.up if self.vertical_known else None
 
     def gravity(self, weight: float) -> Gravity | None:
-        """Gravity for a start, with the weight of its energy; None if unknown or not used."""
+        """Gravity for the start of a track, with its energy's weight; None if unknown or unused."""
         return Gravity(self.plane, weight) if self.vertical_known and weight > 0 else None
 
     def with_contacts(self, body: Body, modes: Modes, before: Modes | None, dt: float) -> Modes:
@@ -273,8 +274,8 @@ class GroundEstimator:
         Args:
             body: body of the modes.
             modes: modes of an image.
-            before: modes of the previous image, in the same camera frame, which are the ancestors;
-                None: the track starts.
+            before: modes of the previous image (the ancestors), in the same camera frame; None: the
+                track starts.
             dt: time since the previous image, s.
         """
         points = sole_points(body, modes.poses)
@@ -285,7 +286,7 @@ class GroundEstimator:
         return replace(modes, soles=points, contacts=found)
 
     def by_foot(self, modes: Modes) -> dict[str, float]:
-        """Probability of the heaviest mode resting on each foot, 'left_foot' and 'right_foot'.
+        """Probabilities that 'left_foot' and 'right_foot' of the heaviest mode rest on the floor.
 
         Empty if there are no modes, if the ground terms are off, if the body has no feet, or while
         the motion of the camera is unknown.
@@ -329,7 +330,7 @@ class GroundEstimator:
         self._refresh_estimate()
 
     def _log_odds_by_person(self, cosine: float, dt: float) -> float:
-        """Log odds against the given vertical, nats, from its cosine with a person's axis."""
+        """Log odds against the given vertical, nats, from its cosine with the axis of a person."""
         stands = 2.0 * UPRIGHT_CONCENTRATION
         stands *= elementary.exp(UPRIGHT_CONCENTRATION * (cosine - 1.0))
         most = RIGHT_VERTICAL_NATS * (1.0 + max(-cosine, 0.0))
@@ -404,7 +405,7 @@ class Gravity:
 
     Attributes:
         plane: direction against gravity and its standard deviation; the height is not used.
-        weight: factor on the energy of the lean, more than 0.
+        weight: positive factor on the energy of the lean.
     """
 
     plane: FloorPlane

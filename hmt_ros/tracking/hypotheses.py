@@ -72,7 +72,7 @@ class Hypotheses:
             poses: (N, d) poses.
             jumped: (N, d) degrees of freedom that jump.
             expected: (N, d) centres of the motion prior; None: new values for jumped degrees of
-                freedom, values of the source hypotheses for the others.
+                freedom, values of the source hypotheses for all other degrees of freedom.
         """
         if expected is None:
             expected = np.where(jumped, poses, self.expected[rows])
@@ -123,7 +123,7 @@ class Modes(Hypotheses):
     Attributes:
         velocities: (N, d) velocities of the variables, per second.
         covariances: (N, d, d) covariances of the posterior, given all images so far.
-        filtered: (N, d, d) covariances for errors that are independent from image to image.
+        filtered: (N, d, d) covariances that would result from independent errors in each image.
         log_likelihoods: (N,) log likelihoods of the image.
         state_covariances: (N, n, n) propagated covariances of poses and velocities. For a random
             walk they are `filtered`; with velocities each image has a weight below 1, because
@@ -151,7 +151,7 @@ class Modes(Hypotheses):
 
     @classmethod
     def blank(cls, count: int, dimension: int) -> Modes:
-        """Modes (count,) with all values zero or empty; count is 0 without a track."""
+        """Returns `count` modes with all values zero or empty; count is 0 without a track."""
         numbers, vectors = np.zeros(count), np.zeros((count, dimension))
         matrices, nothing = np.zeros((count, dimension, dimension)), np.zeros((count, 0))
         return cls(
@@ -180,8 +180,8 @@ class Identities:
     """Persistent numbers of the modes of a track, from 1 on.
 
     The heaviest descendant without a jump inherits the number of its ancestor. If every descendant
-    jumped, the heaviest with some unjumped degree of freedom inherits it. All other modes get new
-    numbers.
+    jumped, the heaviest descendant with a degree of freedom that did not jump inherits it. All
+    other modes get new numbers.
     """
 
     def __init__(self) -> None:
@@ -217,7 +217,7 @@ class Identities:
 
 
 def new_hypotheses(poses: Array, log_weights: Array, exchanges: Array | None = None) -> Hypotheses:
-    """Creates hypotheses (N, d), each its own ancestor.
+    """Creates N hypotheses, each of which is its own ancestor.
 
     Args:
         poses, log_weights: poses (N, d) and log weights (N,).
@@ -235,11 +235,11 @@ class PosePrediction:
     """Poses from an external single-image predictor, such as a mixture of experts.
 
     Attributes:
-        mixture: mixture over poses (d,), with some weight above 0.
+        mixture: mixture over poses (d,), with at least one positive weight.
         body: body of the poses, with its assumed lengths.
 
     Raises:
-        ValueError: the mixture has another dimension than the body, or no weight.
+        ValueError: the dimensions of mixture and body differ, or all weights are 0.
     """
 
     mixture: GaussianMixture
@@ -255,7 +255,7 @@ class PosePrediction:
             raise ValueError('a prediction has no weight')
 
     def seen_as(self, body: Body) -> GaussianMixture:
-        """Converts the mixture to a body of other lengths or level; distances scale with size.
+        """Converts the mixture to a body of other lengths or level; distances scale with its size.
 
         Raises:
             ValueError: the body has other degrees of freedom.
@@ -273,7 +273,7 @@ class PosePrediction:
         )
 
     def both_ways(self, body: Body) -> GaussianMixture:
-        """Like `seen_as`, plus reversals in depth, which have nearly the same silhouettes."""
+        """Result of `seen_as`, and its depth reversals, which have nearly the same silhouettes."""
         seen = self.seen_as(body)
         return GaussianMixture(
             np.tile(0.5 * seen.weights, 2),

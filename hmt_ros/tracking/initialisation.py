@@ -63,9 +63,9 @@ class Start:
 
     Attributes:
         body: body of the person; its shape is estimated while the track lasts.
-        poses: (M, d) distinct poses, best first; with `expected`, its means.
+        poses: (M, d) distinct poses, best first; if `expected` is given, its means.
         expected: mixture over poses; None: all poses have the same weight.
-        clicked: keypoints of a subject file, which replace the detected ones at the start.
+        clicked: keypoints of a subject file, which replace the detected keypoints at the start.
     """
 
     body: Body
@@ -95,7 +95,7 @@ def start_from_keypoints(
         subject: joints and measurements of the person.
         upright: gravity; None: unknown, and the prior keeps the root near the camera's axes.
         depths: depths of the image with the joints; None: unknown. They are dropped if the stature
-            becomes implausible, or if they do not show the surface of the best pose.
+            becomes implausible, or if they disagree with the surface of the best pose.
 
     Raises:
         ValueError: no pose can be fitted to the joints.
@@ -164,7 +164,7 @@ def poses_from_keypoints(
 ) -> Array:
     """Poses (M, d) that explain the joints of an image, best first, with known lengths.
 
-    Depths that do not show the surface of the best pose are not used.
+    Depths that disagree with the surface of the best pose are not used.
 
     Raises:
         ValueError: no pose can be fitted to the joints.
@@ -188,8 +188,8 @@ def poses_from_outline(body: Body, camera: Camera, outline: Outline) -> Array:
 def mixture_from_box(body: Body, camera: Camera, box: Box) -> GaussianMixture:
     """Mixture of mean poses at several headings that fill a box (left, top, right, bottom), px.
 
-    Limbs have the variances of the body's prior; the standard deviation of the place is the
-    fraction `BOX_SIGMA` of the distance.
+    Limbs have the variances of the body's prior; the standard deviation of the position is
+    `BOX_SIGMA` times the distance.
     """
     left, top, right, bottom = box
     middle = (0.5 * (left + right), 0.5 * (top + bottom))
@@ -229,7 +229,7 @@ def _level_rays(body: Body, camera: Camera, pixels: Array) -> Array:
 
 
 def _poses_between(body: Body, low: Array, high: Array) -> Array:
-    """Mean poses (HEADINGS, d) at several headings that fill a box of level rays (2,)."""
+    """Mean poses (HEADINGS, d) that fill a box with two level rays (2,) as corners."""
     middle = 0.5 * (low + high)
     result = np.tile(body.prior_mean, (HEADING_COUNT, 1))
     result[:, :3] = 0.0
@@ -252,7 +252,7 @@ def _sized(body: Body, subject: Subject) -> Body:
     known = subject.segment_lengths
     names = body.skeleton.length_names
     if known:
-        # Unmeasured lengths are scaled like the measured ones.
+        # Unmeasured lengths are scaled like the measured lengths.
         factor = sum(known.values()) / sum(body.segment_lengths[x] for x in known)
         scaled = {x: body.segment_lengths[x] * factor for x in names if x not in known}
         body = body.with_segment_lengths({**scaled, **known})
@@ -309,7 +309,7 @@ def _fit_with_lengths(
             if len(error) < residuals:
                 value[i], gradient[i], hessian[i] = np.inf, 0.0, np.eye(d + count)
                 continue
-            # The first rows are keypoints, the others depths of joints.
+            # The first rows are keypoints, the other rows depths of joints.
             far = frames.joints()[measured.joints, :, 0]
             cost, pull, curvature = measured.residuals(far[:, 2])
             joints = np.concatenate([joints, measured.joints])
@@ -371,7 +371,7 @@ def _first_guesses(
     upright: Gravity | None,
     measured: JointDepths,
 ) -> Array:
-    """Mean poses at several headings, placed at the keypoints; their spread gives the distance."""
+    """Mean poses at several headings, placed at the keypoints, whose spread gives the distance."""
     seen = keypoints.seen
     pixels = keypoints.pixels[seen]
     names = [x for x, ok in zip(keypoints.names, seen, strict=True) if ok]

@@ -50,7 +50,7 @@ class LaggedWeights:
         if lag < 0:
             raise ValueError(f'lag must not be negative, saw {lag}')
         self.lag = lag
-        # At most L + 1 posteriors that await their result, with their origins.
+        # At most L + 1 posteriors that wait for later images, with their origins.
         self._waiting: list[tuple[Lagged, Array]] = []
 
     def update(self, stamp: int, posterior: GaussianMixture, origins: Array) -> list[Lagged]:
@@ -63,11 +63,11 @@ class LaggedWeights:
                 image; M is 0 at the start of a track.
 
         Returns:
-            Finished posteriors, oldest first: that of L images ago, if it belongs to the same
-            track; at the start of a track also all remaining posteriors of the previous track.
+            Finished posteriors, oldest first: the posterior of L images ago, if it belongs to the
+            same track; at the start of a track also all remaining posteriors of the previous track.
 
         Raises:
-            ValueError: the origins have another shape.
+            ValueError: the shape of the origins is inconsistent.
         """
         begins = origins.shape[1] == 0
         result = self.finish() if begins else []

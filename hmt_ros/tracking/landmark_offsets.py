@@ -4,8 +4,8 @@
 
 o_l is the usual offset of landmark l in the frame of its segment, R_l, and d_l the deviation due to
 person, clothes and detector. Errors of a keypoint persist for seconds, so at most `MAX_RATE` images
-per second count. Keypoints alone cannot distinguish an offset from a pose, so edges or silhouettes
-must be evidence, too.
+per second are counted. Keypoints alone cannot distinguish an offset from a pose, so edges or
+silhouettes are required, too.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class LandmarkOffsets:
     def after(
         self, keypoints: Keypoints, body: Body, camera: Camera, pose: Array, dt: float
     ) -> LandmarkOffsets:
-        """Returns the estimate after an image.
+        """Returns the estimate updated by an image.
 
         Args:
             keypoints: keypoints of the image, as returned by `applied`.

@@ -5,8 +5,8 @@
     state        N(pose, velocity) conditioned on the found pose; see `motion_states`
 
 H is the Gauss-Newton Hessian of the energy at an optimum, and H_prior the Hessian of the terms of
-body and ground, without the motion prior. Errors persist, so a cue counts with its share a_g, and
-the covariance given all images so far is T times the covariance given one image
+body and ground, without the motion prior. Errors persist, so the Hessian of a cue is weighted by
+its share a_g, and the covariance given all images so far is T times the covariance given one image
 (`inference.error_model`). Uncertainty of the shape makes the pose uncertain: J P J'
 (`shape_estimation`). A variable on its limit hardly varies.
 

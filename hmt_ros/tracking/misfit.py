@@ -6,8 +6,8 @@
     depth        energy of the visible surface, as a share of the largest possible
 
 Clothes in the colours of the scene are not foreground, and a mask of another image misses the
-person. A depth image that is late or not registered shows the background at the limbs of the model,
-so that most points have the maximum cost of their kernel at any pose.
+person. A depth image that is late or not registered shows the background at the limbs of the model.
+Most points then have the maximum cost of their kernel at any pose.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Misfit(NamedTuple):
 
     Attributes:
         shares: (G,) unexplained shares, from 0 to 1.
-        counts: (G,) numbers of measurements; 0: share unknown.
+        counts: (G,) numbers of measurements; if 0, the share is unknown.
     """
 
     shares: Array
@@ -63,12 +63,13 @@ def of_silhouette(
 ) -> dict[str, Misfit]:
     """Misfits of a silhouette and of its outline, given modes.
 
-    Without a silhouette the result is empty. The misfit of points to an empty silhouette is left
-    out, unless there are keypoints.
+    Without a silhouette the result is empty. An empty silhouette gives a misfit of surface points
+    only if there are keypoints.
 
     Args:
         body, camera, poses: body, camera and poses (K, d) of the modes, heaviest first.
-        observation: observation of the image; its outline is used even if the likelihood does not.
+        observation: observation of the image; its outline is used even if the likelihood leaves it
+            out.
         term: settings of the energies of outline samples.
         costs: (K, M) energies of outline samples in the likelihood.
         points: visible surface points of the modes; None: unknown.
@@ -109,7 +110,7 @@ def of_outline(costs: Array, term: TermSettings, belief: float) -> float:
 
     Args:
         costs: (K, M) energies of the samples at the modes.
-        term: settings of the energies: their weight, shared among the samples, and the kernel.
+        term: settings of the energies; the weight is divided among the samples.
         belief: factor on the weight of the term.
     """
     if costs.size == 0:
@@ -122,7 +123,7 @@ def of_outline(costs: Array, term: TermSettings, belief: float) -> float:
 def outline_costs(
     body: Body, camera: Camera, poses: Array, foreground: Mask, term: TermSettings
 ) -> Array:
-    """Energies (K, M) of samples of the outline of a silhouette at poses (K, d).
+    """Energies (K, M) of samples on a silhouette's outline, at poses (K, d).
 
     Args:
         body, camera, poses: body, camera and poses to compare with the silhouette.
@@ -138,7 +139,7 @@ def outline_costs(
 
 
 def of_keypoints(term: KeypointTerm, poses: Array) -> Misfit:
-    """Share of the keypoints of each group that the best of poses (K, d) does not explain.
+    """Unexplained share of the keypoints in each group, for the best of poses (K, d).
 
     For each pose the most likely exchange of sides is assumed.
     """
@@ -165,9 +166,9 @@ def of_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap) -> Arra
 
 
 def of_depth_at_best(body: Body, camera: Camera, pose: Array, depths: ImageMap) -> float:
-    """Unexplained share of depths at a pose (d,), or at this pose moved to them if smaller.
+    """Unexplained share of depths, minimum over a pose (d,) and this pose moved to the depths.
 
-    A track without depths may be at a wrong distance.
+    A track that was fitted without depths may be at a wrong distance.
     """
     poses = np.concatenate([pose[None], moved_to_depth(body, camera, pose[None], depths)])
     return float(of_depth(body, camera, poses, depths).min())

@@ -31,17 +31,17 @@ from hmt_ros.tracking.validity import Validity
 
 
 class View(NamedTuple):
-    """An image with its inputs, and what it shows before a pose is known.
+    """An image with its inputs, and results that do not need a pose.
 
     Attributes:
         image: (H, W, 3) BGR image.
         stamp: timestamp of the image, ns.
-        keypoints: keypoints from a detector, which saw nobody if no keypoint is seen; None: no
-            detector, or no answer.
+        keypoints: keypoints from a detector; if no keypoint is seen, it found nobody. None: no
+            detector, or no result.
         prediction: pose hypotheses from an external predictor, if any.
         mask: (H, W) pixels of the person from a segmenter; None: unknown.
         predicted: whether a predictor found a person in this image; None: no predictor, or no
-            answer.
+            result.
         others: (H, W) pixels that other people cover; None: no such pixels.
         depth: (H, W) depth along the axis of the camera, m; None: unknown.
         silhouette: (H, W) foreground near the person, possibly empty; None: neither background nor
@@ -77,7 +77,7 @@ class Observer:
         silhouettes: source of the silhouettes.
 
     Attributes:
-        last_image: (H, W, 3) image from which the optical flow starts; None: no flow.
+        last_image: (H, W, 3) previous image, for the optical flow; None: no flow.
     """
 
     def __init__(self, camera: Camera, settings: TrackerSettings, silhouettes: Silhouettes) -> None:
@@ -142,7 +142,8 @@ class Observer:
         Args:
             view: view of the image.
             pose: (d,) approximate pose; None: unknown.
-            validity: validity of the cues; cues that more likely show something else are left out.
+            validity: validity of the cues; a silhouette or depth image that is probably invalid is
+                left out.
         """
         likelihood = self._settings.likelihood
         weighed = [term for term in TERMS if getattr(likelihood, term.name).weight > 0]

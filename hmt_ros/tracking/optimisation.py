@@ -2,7 +2,7 @@
 
 x_k = argmin E(x)          bounded Newton from x_k^0, within the joint limits
 
-An image that moves the modes far, for example in fast motion, is surprising, and gets more
+An image that moves the modes far, for example in fast motion, is surprising, and is given more
 evaluations. The condition is
 
     m' P m  >  `SURPRISING_RATIO` E m' P m  =  `SURPRISING_RATIO` tr(I - P H^-1)

@@ -29,7 +29,7 @@ MAX_STEPS = 2
 # Distance e of joints below which modes agree, m: the amplitude of jitter. Chosen by accuracy on
 # tracked clips.
 AGREEMENT_DISTANCE = 0.03
-# Lever l of joints about an axis below which the angle stays at the weighted mean, m. Chosen.
+# Lever arm l of joints about an axis, m, below which the angle stays at the weighted mean. Chosen.
 MIN_LEVER = 0.01
 
 
@@ -55,7 +55,7 @@ def point_estimate(body: Body, posterior: GaussianMixture) -> Array:
 
 
 def _facing_alike(body: Body, posterior: GaussianMixture) -> Mask:
-    """Selects the components (K,) that face the likelier of two opposite ways."""
+    """Selects the components (K,) that face in the more likely of two opposite directions."""
     weights = posterior.weights
     if not body.trunk_pairs:
         return np.ones(len(weights), dtype=np.bool_)

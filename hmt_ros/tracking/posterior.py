@@ -83,7 +83,7 @@ class ImageFit:
 
 
 class Posterior:
-    """Energies of poses of a body that a camera sees, and their minima.
+    """Energies of the poses of a body in front of a camera, and minima of these energies.
 
     Args:
         body, camera: body of the person, and camera.
@@ -126,7 +126,7 @@ class Posterior:
 
     @cached_property
     def divided(self) -> dict[str, tuple[ImageLikelihood, ImageLikelihood]]:
-        """For each limb, the likelihood of its flesh and that of the rest of the body."""
+        """For each limb, the likelihood of its flesh, and the likelihood of all other flesh."""
         chains, parts = self.body.skeleton.chains, self.body.flesh.parts
         result = {}
         for chain in (chain for pair in self.body.chain_pairs for chain in pair):
@@ -170,7 +170,7 @@ class Posterior:
         return (*seen, *self.likelihood.priors, *self.known(observation))
 
     def known(self, observation: Observation) -> tuple[FrameTerm | GroundTerm, ...]:
-        """Terms other than those of image and body: the extra terms, gravity and floor."""
+        """Extra terms, and terms of gravity and floor, but no terms of image and body."""
         if self.ground is None:
             return self.extra
         plane, last = self.ground.plane, self._ground_term
@@ -240,8 +240,8 @@ class Posterior:
     ) -> Array:
         """Energies (N,) of an image, nats, to subtract from the log weights of poses (N, d).
 
-        Exchanges of sides form a Markov chain (`classes`), so their prior counts fully, while
-        energies count by their shares.
+        Exchanges of sides form a Markov chain (`classes`), so their prior is not discounted, while
+        energies are weighted by their shares.
 
         Args:
             poses: (N, d) poses.

@@ -42,7 +42,7 @@ def predict(
 
     Args:
         modes: modes of the last image.
-        body: body with the limits, and the rates of variables that jump.
+        body: body that defines the limits, and the rates of variables that jump.
         dynamics: dynamics of the modes.
         dt: time since the last image, s.
     """
@@ -69,7 +69,7 @@ class Forecaster:
 
     Attributes:
         modes: published modes of that image.
-        body: body with the limits.
+        body: body that defines the limits.
         motion: value of the setting `motion`.
         stamp_ns: timestamp of the image.
     """
@@ -91,7 +91,7 @@ class Forecaster:
             )
         modes, body, d = self.modes, self.body, self.body.dimension
         known = modes.state_covariances.copy()
-        # The published covariances of the poses are larger than the propagated ones.
+        # The published covariances of the poses are larger than the propagated covariances.
         known[:, :d, :] = known[:, :, :d] = 0.0
         known[:, :d, :d] = modes.covariances
         dynamics = dynamics_of(body, self.motion)

@@ -1,11 +1,11 @@
-"""Select: few hypotheses that represent all (KJS figure 4, step 5).
+"""Select: a few hypotheses that represent all hypotheses (KJS figure 4, step 5).
 
     min over S, |S| = K:   sum_i w_i min_{s in S} d(i, s)
 
 The K heaviest hypotheses would be near copies of the heaviest. Instead, K hypotheses are chosen
 greedily, heaviest first, to minimise the expected distance from a hypothesis to the nearest kept
-one. d is the mean of the joint distances, each capped; two hypotheses closer than a minimum are the
-same. A dropped hypothesis adds its weight to the nearest kept one.
+hypothesis. d is the mean of the capped joint distances; hypotheses closer than a minimum are
+treated as equal. The weight of a dropped hypothesis is added to the nearest kept hypothesis.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hmt_ros.tracking.settings import MAX_JOINT_DISTANCE
 
 
 class Kept(NamedTuple):
-    """Selected hypotheses, which represent all others.
+    """Selected hypotheses, which represent all other hypotheses.
 
     Attributes:
         chosen: (K,) indices of the selected hypotheses, in the order of selection.
@@ -46,11 +46,11 @@ def choose_hypotheses(
     """Selects the hypotheses to keep.
 
     Args:
-        joints: (N, J, 3) positions for the distances, m.
+        joints: (N, J, 3) joint positions from which distances are computed, m.
         log_weights: (N,) log weights.
         count: maximum number of kept hypotheses, K.
-        same: mean distance below which two hypotheses are the same, m.
-        cap: distance of a joint at which it is capped, m.
+        same: mean distance below which two hypotheses are treated as equal, m.
+        cap: maximum distance of a joint, to which larger distances are clipped, m.
         first: indices of hypotheses that are always kept, after the heaviest.
     """
     n = len(log_weights)
@@ -73,9 +73,9 @@ def distinct_hypotheses(joints: Array, log_weights: Array, same: float) -> Index
     """Indices of hypotheses at distinct optima, heaviest first.
 
     Args:
-        joints: (N, J, 3) positions for the distances, m.
+        joints: (N, J, 3) joint positions from which distances are computed, m.
         log_weights: (N,) log weights.
-        same: mean distance below which two hypotheses are the same, m.
+        same: mean distance below which two hypotheses are treated as equal, m.
     """
     order, kept = np.argsort(-log_weights, kind='stable'), np.empty(len(joints), dtype=np.intp)
     count = keep_apart(np.ascontiguousarray(joints, dtype=np.float64), order, same, kept)

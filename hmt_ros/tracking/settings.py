@@ -1,9 +1,9 @@
 """Settings of a tracker, and constants of its model.
 
 Users choose the settings. Each constant has its unit and its source: `Physical` constants are
-properties of people or sensors, `Chosen` ones were tuned by hand on tracked clips. Constants of
-lower layers are defined there: of the person in `body`, of silhouettes, colours and keypoints in
-`image`, of errors of cues in `inference.error_model`.
+properties of people or sensors, `Chosen` constants were tuned by hand on tracked clips. Lower
+layers define their own constants: `body` for the person, `image` for silhouettes, colours and
+keypoints, and `inference.error_model` for errors of cues.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ MAX_JOINT_DISTANCE = 0.3
 TRANSITION_SPREAD, TRANSITION_TAILS = 0.01, 2.0
 # Constant c, nats: a mode ends if all its continuations are less likely than exp(-c). Chosen.
 END_NATS = 5.0
-# Largest shift from a mode of the posterior to that of the likelihood, in standard deviations of
-# the posterior: a likelihood may be flat. Chosen.
+# Largest shift from a posterior mode to the likelihood's mode, in standard deviations of the
+# posterior, because a likelihood may be flat. Chosen.
 MAX_MODE_SHIFT = 5.0
 # Standard deviations above which a measurement is unexplained or a value implausible. Chosen.
 GATE_SIGMAS = 4.0
@@ -87,35 +87,39 @@ GIVEN_UP_SIGMA = np.radians(2.0)
 # Chosen.
 UP_SIGMA = np.radians(15.0)
 # Standard deviation of the angle between the axis of a standing body and the vertical, rad, twice
-# as large along the line of sight; lower bound for the estimated vertical. Chosen.
+# as large along the line of sight; also a lower bound on the error of the estimated vertical.
+# Chosen.
 AXIS_SIGMA = np.radians(4.0)
 # Correlation time of errors of the vertical from the body's axis or from lines, s. Chosen.
 VERTICAL_TIME = 1.0
 # Drift of the vertical, rad/sqrt(s). Chosen.
 UP_DRIFT = np.radians(1.0)
-# Time window for the height of the lowest sole, s, and its quantile that is the floor. Chosen.
+# Time window for the level of the lowest sole, s, and quantile of these levels at the floor.
+# Chosen.
 LEVEL_TIME, LEVEL_QUANTILE = 2.0, 0.75
-# Standard deviation of the floor's height from that quantile, m; larger with few images. Chosen.
+# Standard deviation of the floor's height from the quantile of levels, m; larger with few images.
+# Chosen.
 LEVEL_SIGMA = 0.04
-# Change of the given direction of gravity, above sensor noise, that shows a turning camera, rad.
+# Change of the given direction of gravity that indicates a turning camera, rad; above sensor noise.
 # Physical.
 TURN_NOISE = 0.003
 # Number of images with a person head down after which a given vertical that points up in the image
-# is reversed: handstands are shorter. Each counts by the cosine of trunk and vertical. Chosen.
+# is reversed: handstands are shorter. Each image is weighted by the cosine of the angle between
+# trunk and vertical. Chosen.
 HEAD_DOWN_IMAGES = 30.0
 # Prior log odds for the given vertical of a nearly upright camera, nats, and bound on the evidence
 # against it from a person's axis, because some people do lie down. Chosen.
 RIGHT_VERTICAL_NATS = 3.5
-# Largest log odds from one look at the lines of the scene, nats. Chosen.
+# Largest log odds from one evaluation of the lines of the scene, nats. Chosen.
 LOOK_NATS = 2.0
-# Concentration about the vertical of the axes of people who are not lying down. Chosen.
+# Concentration of the body axis about the vertical, for people who are not lying down. Chosen.
 UPRIGHT_CONCENTRATION = 8.0
 
 # --- Camera and appearance
 
 # Maximum time for which the last known motion of the camera is extrapolated, s. Chosen.
 MAX_EXTRAPOLATION_TIME = 0.5
-# Fraction that counts as most of an image or of a person.
+# Minimum fraction that is regarded as most of an image or of a person.
 MAJORITY_FRACTION = 0.5
 # Fraction of the usual value at which a silhouette is no evidence; 0 is full evidence of absence,
 # and twice this fraction is full evidence of presence. Chosen.
@@ -142,25 +146,26 @@ class LimbSearchSettings:
 
 @dataclass(frozen=True)
 class EvaluationPlan:
-    """Allocation of an image's evaluations; counted, not timed, so that results are repeatable.
+    """Allocation of evaluations in an image; limits are counts, not times, for repeatable results.
 
         budget B    predictions descend    limbs and trunks are rated    candidates descend
         share       about B / 8            at most 2 B / 3                about B / 5
 
-    If limbs are searched too, at most 2 B / 5 are rated. The rest is for covariances and shape of
-    the modes, and for the likelihood. Settings bound each part; a smaller budget reduces all parts.
+    If limbs are searched too, at most 2 B / 5 poses are rated. The rest of the budget is for
+    covariances and shape of the modes, and for the likelihood. Settings bound each part; a smaller
+    budget reduces all parts.
 
     Attributes:
         hypotheses: maximum number of modes that are kept, K.
         candidates: maximum number of hypotheses that are fully optimised.
         iterations: maximum number of Newton steps, for predictions and for candidates.
-        groups: maximum number of groups of modes with a common trunk that are searched.
+        groups: maximum number of searched groups; the modes of a group have a common trunk.
         rated: maximum number of rated poses in all groups, if limbs are searched.
         rated_alone: maximum number of rated poses in all groups, if no limb is searched.
         alternatives: maximum number of configurations per limb.
         combinations: maximum number of combinations of limb configurations on each trunk.
         searched_chains: maximum number of limbs searched in each group.
-        samples, refined: number of samples per limb, and number of the best that are refined.
+        samples, refined: number of samples per limb, and number of best samples to refine.
         surprising: whether the image is surprising.
     """
 
@@ -279,7 +284,7 @@ class TrackerSettings:
             rated_alone=2 * budget // 3,
             alternatives=min(self.alternatives, max(limbs, 2)),
             combinations=min(self.combinations, eighth),
-            # With less than a quarter of the accurate budget no limb is searched.
+            # Below a quarter of the accurate budget, limb searches are skipped.
             searched_chains=min(self.searched_chains, searched)
             if SURPRISING_FACTOR * budget >= ACCURATE_BUDGET
             else 0,
@@ -296,7 +301,7 @@ RATES: Mapping[str, tuple[float, float]] = MappingProxyType(
     {
         # A person enters an empty view, and leaves it. Chosen.
         'existence': (0.1, 0.2),
-        # Another person replaces the unseen one once in an hour. Chosen.
+        # Another person replaces the unseen person once in an hour. Chosen.
         'same person': (0.0, 1.0 / 3600.0),
         # A track or a cue recovers from a failure, and fails. Chosen.
         'track and cues': (1.0, 0.05),
@@ -304,9 +309,10 @@ RATES: Mapping[str, tuple[float, float]] = MappingProxyType(
         'detector': (1.0, 0.02),
     }
 )
-# Largest log likelihood ratio of somebody against nobody from an image, nats, and correlation time
-# of its errors, s. A clear image is wrong in 1 of 3,000 cases, from a persistent cause outside the
-# model. A detector misses a badly visible person in about 1 of 100 images, for longer. Chosen.
+# Largest log likelihood ratio of a person against nobody in view from an image, nats, and
+# correlation time of its errors, s. A clear image is wrong in 1 of 3,000 cases, from a persistent
+# cause outside the model. A detector misses a badly visible person in about 1 of 100 images, and
+# for a longer time. Chosen.
 EXISTENCE_CUES: Mapping[str, tuple[float, float]] = MappingProxyType(
     {'clear': (8.0, 0.2), 'doubtful': (5.0, 0.25)}
 )
@@ -316,7 +322,7 @@ PRESENT_PROBABILITY, ABSENT_PROBABILITY = 0.85, 0.03
 # Weight of a silhouette that the image border may cut, and of keypoints of a part of a person.
 # Chosen.
 PART_FRACTION = 0.6
-# Difference in evidence between a fully explained cue and an unexplained one, nats, and number of
+# Difference in evidence between a fully explained and a fully unexplained cue, nats, and number of
 # measurements for full evidence: neighbours have common errors. Chosen.
 VALIDITY_NATS, VALIDITY_COUNT = 16.0, 4
 # Correlation time of misfits of the modes to a cue, s. Chosen.
@@ -328,11 +334,12 @@ MAX_CUE_NATS = 3.5
 PLACED_PROBABILITY = 0.8
 # Probability that the evidence of an image for a facing direction is about the person. Chosen.
 FACING_VALIDITY = 0.9
-# Largest log odds of a facing direction, nats, also used if a start has only one. Chosen.
+# Largest log odds of a facing direction, nats, also for a start in which all poses face one way.
+# Chosen.
 MAX_FACING_NATS = 10.0
-# Least probability of an exchange of sides by a detector. Chosen.
+# Minimum probability that a detector exchanges sides. Chosen.
 MIN_EXCHANGE_PROBABILITY = 1e-6
-# Largest difference in log weight between the heaviest mode and a likely one, nats. Chosen.
+# Largest difference in log weight between the heaviest mode and a likely mode, nats. Chosen.
 LIKELY_NATS = 4.0
 # Probability that a person stands on both feet if contact is unknown. Chosen.
 RESTING_SHARE = 0.3
@@ -344,7 +351,7 @@ MINIMUM_TOLERANCE = 0.02
 # Standard deviations of a variable of a mode, rad or m: maximum, without evidence, and on a limit
 # (3 degrees). Chosen.
 MAX_SIGMA, LIMIT_SIGMA = 2.0, 0.05
-# Number of shape fits to the first image, and number of heaviest modes for the shape. Chosen.
+# Number of shape fits to the first image, and number of heaviest modes used in a fit. Chosen.
 FIRST_SHAPE_FITS, MAX_SHAPE_MODES = 3, 4
 # Largest distance of a person from the prediction, m, and its growth with time, m/s; keypoints
 # further away belong to another person. No clip reaches it.

@@ -6,12 +6,13 @@
     P = (P_0^-1 + A / (1 + c n))^-1,    theta = P b / (1 + c n)
 
 theta is the shape (see `body.shape`), x_k the pose of mode k, and h and H are the gradient and the
-Gauss-Newton Hessian of the energy of one image over both. The pose adapts to a wrong shape: the
-remaining information is the Schur complement S. Every image counts with the share tau, because
-neighbouring images have the same errors. All images together count as at most 1 / c images
-(`inference.error_model`), because clothes and other unmodelled effects are the same in all of them,
-and would finally outweigh the prior over people. Uncertainty of the shape makes the pose uncertain:
-J P J' is added to the covariances of modes (a consider covariance, [Schmidt 1966]).
+Gauss-Newton Hessian of the energy of one image over shape and pose. The pose adapts to a wrong
+shape, so the remaining information on the shape is the Schur complement S. Every image is weighted
+by its share tau, because neighbouring images have the same errors. All images together are worth at
+most 1 / c images (`inference.error_model`), because clothes and other unmodelled effects are the
+same in all of them, and would finally outweigh the prior over people. Uncertainty of the shape
+makes the pose uncertain: J P J' is added to the covariances of modes (a consider covariance,
+[Schmidt 1966]).
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class ShapeEstimate:
         self._information, self._vector = np.zeros((size, size)), np.zeros(size)
         self._count = 0.0
         self._offset = np.zeros(size)
-        # Offset of the present body, which is rebuilt in steps to follow the estimate.
+        # Shape offset of the present body, which follows the estimate in steps.
         self._taken = self._offset
         self._seen: Observation | None = None
         self._known: tuple[Array, Linearised] | None = None
@@ -99,7 +100,7 @@ class ShapeEstimate:
             gradients: (K, d) gradients of the energy of image and body prior, with respect to the
                 pose.
             covariances: (K, d, d) inverse Hessians of the same energy, 0 for variables on a limit.
-            image_share: share tau with which the image counts.
+            image_share: share tau by which the image is weighted.
         """
         linear = self.linearised(likelihood, observation, poses)
         size, turns = self._space.size, self._space.body.skeleton.dof_is_rotation
@@ -146,8 +147,8 @@ class ShapeEstimate:
     ) -> Linearised:
         """Expands the energy of an image's contours and keypoints around poses (N, d).
 
-        The last result is cached, because the covariances need all modes and the shape then needs
-        the best of them.
+        The last result is cached, because the covariances of all modes need it, and then the shape,
+        from the best modes.
         """
         n = len(poses)
         if self._seen is observation and self._known is not None:

@@ -36,7 +36,7 @@ from hmt_ros.tracking.prediction import Forecaster
 from hmt_ros.tracking.settings import RATES
 from hmt_ros.tracking.validity import Validity
 
-# Markov chain for the person in view being the one seen last.
+# Markov chain of whether the person in view is the person seen last.
 SAME_PERSON_CHAIN = MarkovChain.of_two(*RATES['same person'])
 
 
@@ -83,7 +83,7 @@ class TrackState:
 
     @property
     def nobody_shown(self) -> bool:
-        """Whether the last image shows that nobody is in view, unlike a covered lens."""
+        """Whether the last image is evidence that nobody is in view; a covered lens is not."""
         return self.ended and self.existence.nobody
 
     def age(self, stamp: int) -> float:
@@ -91,7 +91,7 @@ class TrackState:
         return 0.0 if self.followed is None else seconds(stamp - self.followed)
 
     def is_somebody_else(self, stamp: int) -> bool:
-        """Whether a person in view at a timestamp, ns, is probably not the one seen last."""
+        """Whether a person in view at a timestamp, ns, is probably not the person seen last."""
         if self.last_seen_stamp is None:
             return False
         return bool(SAME_PERSON_CHAIN.closed(1.0, seconds(stamp - self.last_seen_stamp)) < 0.5)
@@ -127,7 +127,8 @@ class Estimate:
         reason: text that explains why no person is tracked; '' if none is needed.
         existence_probability: probability that a person is in view, given all images so far; NaN
             without any evidence.
-        nobody_shown: whether the last image shows that nobody is in view, unlike a covered lens.
+        nobody_shown: whether the last image is evidence that nobody is in view; a covered lens is
+            not.
         started_from: input from which the track started; None before the first track.
         body: body with the present estimate of lengths and flesh.
         modes: propagated modes of the track, heaviest first; empty without a track.
@@ -135,19 +136,20 @@ class Estimate:
         point_estimate: (d,) pose whose joints have the least expected distance from the person's;
             empty without a track.
         likelihood: likelihood of the last image in which the person was tracked.
-        shown: evidence from the last image, weighted by the beliefs; None without a fit to it.
+        shown: evidence from the last image, with each cue weighted by its validity; None if the
+            modes were not fitted to the image.
         foreseen: whether a prediction is published, because the last image did not show the person.
         misfit: share of the last image that no mode explains.
         evaluations: number of evaluations of the likelihood in the last image.
         validity: probabilities that the track and each cue of the images are valid.
-        contacts: probability of the heaviest mode resting on each foot, 'left_foot' and
-            'right_foot'. Empty if there is no track, the body has no feet, the ground terms are
-            off, or the motion of the camera is unknown. With a background image the camera is
-            fixed; otherwise `Tracker.set_camera` gives its motion.
-        ground: gravity and floor, as far as they are known or estimated.
+        contacts: probabilities that 'left_foot' and 'right_foot' of the heaviest mode rest on the
+            floor. Empty if there is no track, the body has no feet, the ground terms are off, or
+            the motion of the camera is unknown. With a background image the camera is fixed;
+            otherwise `Tracker.set_camera` gives its motion.
+        ground: known or estimated gravity and floor.
         vertical: (3,) unit vector against gravity, camera frame, given or shown by the scene; None
             if unknown, or only guessed from the track.
-        gravity_contradicted: whether scene or person contradict the given gravity; it is used
+        gravity_contradicted: whether scene or person contradict the given gravity, which is used
             anyway.
         gravity_reversed: whether the given gravity is used with the opposite sign, because it has
             the sign of an accelerometer.
@@ -180,7 +182,7 @@ class Estimate:
 
     @property
     def posterior(self) -> GaussianMixture:
-        """Posterior over poses; has no components without a track."""
+        """Posterior over poses, without components if there is no track."""
         return self.published.mixture
 
     @property

@@ -1,4 +1,4 @@
-"""Follows one person through images: starts a track, updates it, notices when it is lost.
+"""Follows one person through images: starts a track, updates it, and detects its loss.
 
     observe      the image, in the present camera frame                    `View`
     believe      existence of a person, and validity of the cues           `TrackState`
@@ -75,14 +75,14 @@ class Tracker:
             before the track starts; without such images, silhouettes are not used.
         seed: random seed. The same images, settings and seed give the same numbers.
         extra: further energy terms of the posterior.
-        known_ground: gravity and floor, as far as they are known; the rest is estimated.
+        known_ground: known values of gravity and floor; unknown values are estimated.
         shared_background: whether several trackers share the background; if so, no tracker learns
             it.
 
     Attributes:
         model, camera, settings: the arguments; the model does not include a subject's lengths.
         silhouettes: source of the silhouettes of the images.
-        track_id: number of the present track, or of the last one; 0 before the first.
+        track_id: number of the present or last track; 0 before the first track.
         estimate: estimate after the last image.
     """
 
@@ -126,17 +126,18 @@ class Tracker:
     def reset(
         self, start: Subject | GaussianMixture | None = None, *, box: Box | None = None
     ) -> None:
-        """Drops the track, so that a new one starts.
+        """Drops the track, so that a new track starts.
 
         Args:
             start: subject, or mixture over poses of the present body. A subject starts the track at
-                the first image at or after its timestamp. None repeats the last given start;
-                without one, the first sufficient keypoints, mask or prediction start a track.
-            box: (left, top, right, bottom) around the person in the next image, px; the track
-                starts in it.
+                the first image at or after its timestamp. None repeats the last given start; if
+                none was given, the first sufficient keypoints, mask or prediction start a track.
+            box: bounding box (left, top, right, bottom) of the person in the next image, px, which
+                starts the track.
 
         Raises:
-            ValueError: the mixture has another dimension, or the box is outside the image.
+            ValueError: the mixture does not have the dimension of the body, or the box is outside
+                the image.
         """
         body = self._track.body
         if isinstance(start, GaussianMixture) and start.dimension != body.dimension:
@@ -171,31 +172,31 @@ class Tracker:
 
         Args:
             image: (H, W, 3) BGR uint8, of the camera's size.
-            stamp: timestamp of the image, ns; later than the previous one.
-            keypoints: joints detected in this image. If none of them is seen, the detector saw
-                nobody; None: there is no detector, or it has not answered.
+            stamp: timestamp of the image, ns; later than the previous timestamp.
+            keypoints: joints detected in this image. If none of them is seen, the detector found
+                nobody. None: no detector, or no result.
             prediction: poses that a regression predicts from this image, if any. They are
                 hypotheses in every image and in the search for a lost track. They also start a
                 track, with the lengths that they assume, if there is no other start and the
                 keypoints do not suffice. They are not evidence, because the image would then be
                 counted twice.
             mask: (H, W) pixels of the person from a segmenter; replaces background subtraction. All
-                False if the segmenter sees nobody; None: unknown.
-            nobody_predicted: whether the regression saw nobody in this image.
+                False if the segmenter found nobody; None: unknown.
+            nobody_predicted: whether the regression found nobody in this image.
             others: (H, W) pixels that other people cover or may cover; they are no evidence about
                 the pose. None: no such pixels.
             depth: (H, W) depth at each pixel, along the axis of the camera, m; 0, NaN and values
-                out of range are no evidence. None: unknown.
+                out of range are ignored. None: unknown.
 
         Returns:
             The posterior p(x_t | R_t) and the likelihood p(r_t | x_t), undiscounted (see
             `Likelihood.errors`), as mixtures over poses, heaviest component first, with weights
-            that sum to 1; (None, None) without a track, that is before the first one or while
+            that sum to 1; (None, None) without a track, that is before the first track or while
             nobody is in view.
 
         Raises:
-            ValueError: an image, mask or depth has another size, the timestamp does not increase,
-                or the body of the prediction has other degrees of freedom.
+            ValueError: an image, mask or depth does not have the camera's size, the timestamp does
+                not increase, or the body of the prediction has other degrees of freedom.
         """
         predicted = False if nobody_predicted else True if prediction is not None else None
         given = View(image, stamp, keypoints, prediction, mask, predicted, others, depth)
@@ -297,7 +298,7 @@ class Tracker:
         return view
 
     def _lifted(self, keypoints: Keypoints | None, stamp: int) -> Keypoints | None:
-        """Adds to keypoints a mixture over whole poses, pooled from experts and a 3D detector."""
+        """Returns keypoints with a mixture over whole poses, from experts and a 3D detector."""
         if keypoints is None or not keypoints.seen.any():
             return keypoints
         opinions = []
@@ -314,9 +315,9 @@ class Tracker:
     # Believe.
 
     def _update_existence(self, view: View) -> None:
-        """Updates the beliefs that a person is in view, and that it is still the same person."""
+        """Updates the existence of a person; drops the track if the person has probably changed."""
         if self._state.is_somebody_else(view.stamp):
-            # Nothing is known about the next person.
+            # Nothing is known about a new person.
             self._landmarks = LandmarkOffsets()
             self._drop_track(replace(self._state, ended=True, last_seen_stamp=None), self.model)
         state = self._state
@@ -336,7 +337,7 @@ class Tracker:
     # Propagate, start or end.
 
     def _propagate(self, view: View) -> Observation:
-        """Propagates the track to an image; returns the observation, weighted by the beliefs."""
+        """Propagates the track; returns the observation, with each cue weighted by its validity."""
         state, track = self._state, self._track
         if state.existence.last.elsewhere:
             view = self._observer.view(view, track.person, None, 0.0)
@@ -356,7 +357,7 @@ class Tracker:
         return believed
 
     def _search(self, observation: Observation, prediction: PosePrediction | None) -> Array | None:
-        """Poses from which to search the image, or None; see `poses_to_search`."""
+        """Starting poses for a search in the image, or None; see `poses_to_search`."""
         gravity = self._ground.gravity(self.settings.ground.upright_weight)
         return poses_to_search(self._track.person, self.camera, observation, prediction, gravity)
 
@@ -383,7 +384,7 @@ class Tracker:
         return replace(observation, beliefs=state.validity.beliefs)
 
     def _given_start(self, view: View, *, somebody: bool) -> Observation | None:
-        """Starts a track from the start given by the user, or from a sufficient image.
+        """Starts a track from the user's start, or from an image with sufficient inputs.
 
         Args:
             view: view of the image.
@@ -444,7 +445,7 @@ class Tracker:
         )
 
     def _drop_track(self, state: TrackState, body: Body | None = None) -> None:
-        """Drops the track; keeps a state, and the body unless another one is given."""
+        """Drops the track; continues with a given state, and with a new body if given."""
         state.existence.appearance = Appearance()
         self._state = replace(state, validity=Validity(), followed=None)
         self._track = self._new_track(body or self._track.body)

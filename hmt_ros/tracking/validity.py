@@ -7,13 +7,13 @@
 P is the joint probability of v = (v_0, v_1, ..). v_0 is 1 if a mode of the track is near the
 person, v_g is 1 if cue g shows the person; a(dt) = tanh(dt / (2 tau)) is the remaining share of an
 image, because misfits persist (`error_model`). A misfit is attributed to the cue or to the track,
-whichever is less probably valid given all other cues: (3) is exact, and summed over v_g it is minus
+whichever is less probably valid given all other cues: (3) is exact. Summed over v_g, it gives minus
 the energy -log(p exp(-E_inlier) + (1 - p) exp(-E_outlier)). e_0 is the evidence of the silhouette's
 outline for the track, even if the silhouette is invalid: clothes in the colours of the room leave
 holes in it, but its remaining parts are at the person.
 
-A mode of a valid track may misplace a part of the body. So e_g of the groups of keypoints becomes
-log(w exp(e_g) + 1 - w) - log(w + (1 - w) exp(e_g)), of size at most log w / (1 - w), with w =
+A mode of a valid track may misplace a part of the body. So for groups of keypoints, e_g is replaced
+by log(w exp(e_g) + 1 - w) - log(w + (1 - w) exp(e_g)), of size at most log w / (1 - w), with w =
 `PLACED_PROBABILITY`, except at a start, where the pose is given. A silhouette of another object
 attracts the modes x, which then explain it. If the modes miss more than a quarter of the keypoints,
 a pose x' fitted to keypoints alone (`proposals.whole_poses`) represents the states with an invalid
@@ -24,13 +24,13 @@ silhouette:
 A pose that was fitted to a cue is no evidence for that cue. t is the transition density of the pose
 from the previous image (`weighting`), used in the image in which x and x' separated.
 
-The misfit of depths is that of a pose moved to them, so depths do not test the track. They have a
-chain of their own, with the evidence log(P(v_0) exp(e_g) + 1 - P(v_0)).
+The misfit of depths is computed at a pose moved to these depths, so depths do not test the track.
+Their validity is a separate chain, with the evidence log(P(v_0) exp(e_g) + 1 - P(v_0)).
 
 In an image each cue has the energy p_g E_g, the first-order expansion of the energy above around
-E_outlier, with the p_g from (1), before the image: weights and optima use the same sum. A
-silhouette, a depth image or a detection is left out if it more likely shows something else. The p_g
-of groups of keypoints are conditional on a detector that sees the person.
+E_outlier, with p_g predicted by (1), so that weights and optima use the same sum. A silhouette, a
+depth image or a detection is left out if it probably does not show the person. The p_g of groups of
+keypoints are conditional on a detector that sees the person.
 """
 
 from __future__ import annotations
@@ -60,15 +60,15 @@ from hmt_ros.tracking.settings import (
 VALIDITY_CHAIN = MarkovChain.of_two(*RATES['track and cues'])
 
 DEPTH = 'depth'
-# Misfit u at which the evidence about a cue is zero. Clothes in the colours of the room leave holes
-# in a silhouette.
+# Misfit u at which the evidence about a cue is zero; large for silhouettes, because clothes in the
+# colours of the room leave holes.
 UNDECIDED_MISFITS = {SILHOUETTE: 0.4, OUTLINE: 0.4, KEYPOINTS: 0.25, DEPTH: 0.15}
 # Axes of the joint probability: the track, the detector of keypoints, and the cues.
 TRACK, DETECTOR = range(2)
 AXES = {SILHOUETTE: slice(2, 3), KEYPOINTS: slice(3, 3 + EXCHANGED.shape[1])}
 CHAINS = AXES[KEYPOINTS].stop
-# States (2^n, n) of the chains, and validity v in each state: a failed detector's groups are
-# invalid.
+# States (2^n, n) of the chains, and validity v in each state: if the detector has failed, its
+# groups are invalid.
 STATES = np.array(np.unravel_index(np.arange(2**CHAINS), (2,) * CHAINS)).T
 # Rates (n, 2) at which each chain recovers and fails, 1/s.
 AXIS_RATES = np.tile(RATES['track and cues'], (CHAINS, 1))
@@ -83,8 +83,8 @@ class ByKeypoints(NamedTuple):
 
     Attributes:
         keypoints: misfit of this pose to the keypoints.
-        gain: log ratio of the transition densities of this pose and of the heaviest mode, nats, in
-            the image in which they separated; 0 after the first report.
+        gain: log ratio of the transition densities to this pose and to the heaviest mode, nats, in
+            the image in which the two separated; reported once, then 0.
     """
 
     keypoints: Misfit
@@ -121,7 +121,7 @@ class Validity:
         return {name: self._chains[axes] for name, axes in AXES.items()} | {DEPTH: self._depth[1:]}
 
     def is_trusted(self, cue: str) -> bool:
-        """Whether a cue more likely than not shows the person; a lost track uses all cues."""
+        """Whether a cue probably shows the person; always true if the track is lost."""
         return self.lost or bool(self.cues[cue].max() >= 0.5)
 
     @property
@@ -131,7 +131,7 @@ class Validity:
 
     @property
     def beliefs(self) -> Beliefs:
-        """Factors on the cues of the next image."""
+        """Factors on the energies of the cues of the next image."""
         cues = self.cues
         silhouette, depth = (float(cues[name][0]) for name in (SILHOUETTE, DEPTH))
         of_person = self.joint * STATES[:, DETECTOR]
@@ -171,7 +171,7 @@ class Validity:
         """Updates the probabilities from the misfits of the modes to the cues of an image.
 
         Args:
-            misfits: misfits by name of the cue, and that of the silhouette's outline.
+            misfits: misfits by cue name, including the silhouette's outline.
             dt: time since the previous image, s; infinite at a start.
             alone: pose fitted to keypoints alone; None: not needed.
         """
@@ -199,11 +199,11 @@ class Validity:
 
 
 def _divided(of_track: Array, share: float, alone: ByKeypoints) -> Array:
-    """Log likelihood ratios (2^n,) of the states when silhouette and keypoints disagree, (4).
+    """Log likelihood ratios (2^n,) of the states by (4), if silhouette and keypoints disagree.
 
     Args:
         of_track: (n,) evidence of each cue at the modes.
-        share: remaining share a(dt) of the image.
+        share: factor a(dt) on the evidence of the image.
         alone: pose fitted to keypoints alone.
     """
     own = of_track.copy()

@@ -7,12 +7,12 @@
 
 x_j are the modes of the previous image and f(x_j) their predictions by the dynamics. D is the mean
 squared distance of the joints relative to the pelvis, and q the mean squared distance between
-people and their predictions after a second. Every hypothesis can continue every mode that is within
-reach in dt, whatever its proposal. A mode continues as one of the hypotheses of the image (2), or
-ends if all hypotheses are less likely than e^-c. The number of hypotheses depends on the search and
-is no evidence: n_k is the number of hypotheses near x_k, because otherwise many copies of a
-hypothesis would take weight from one that was found once. E_g is the energy of cue g, which counts
-with the share a_g (`inference.error_model`).
+joints and their predictions after a second. Every hypothesis can continue every mode that is within
+reach in dt, whichever proposal found it. A mode continues as one of the hypotheses of the image
+(2), or ends if all hypotheses are less likely than e^-c. The number of hypotheses depends on the
+search and is no evidence. So n_k is the number of hypotheses near x_k; otherwise, many copies of a
+hypothesis would take weight from a hypothesis that was found once. E_g is the energy of cue g,
+weighted by its share a_g (`inference.error_model`).
 
 The normaliser |S_k|^(1/2) of a mode is left out, as in the paper: the Hessian shows how well the
 image determines a pose, so a badly determined pose (in depth, or with a limb behind the trunk)

@@ -16,26 +16,26 @@ SUFFIXES = ('.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 VERSION = 9
 MAX_BYTES = 2**19
 
-# Infinite duration as rmw writes it, for no deadline and no lifespan.
+# Infinite duration in the notation of rmw: no deadline and no lifespan.
 _INFINITE_DURATION = {'sec': 9223372036, 'nsec': 854775807}
 
 
 class BagError(ValueError):
-    """A bag can not be read or written; the text is one line with the fault and the remedy."""
+    """A bag can not be read or written; the message, one line, names fault and remedy."""
 
     def __init__(self, text: str) -> None:
         super().__init__(one_line(text))
 
 
 def reason(error: BaseException) -> str:
-    """The text of a library's exception as one line of at most 160 characters."""
+    """Message of a library's exception, as one line of at most 160 characters."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return error_line(error, 160)
 
 
 def absolute_name(topic: str, namespace: str = '') -> str:
-    """Name of a topic as rosbag2 records and compares it: with its namespace and a leading slash.
+    """Absolute name of a topic, as in rosbag2 files: with its namespace and a leading slash.
 
     Args:
         topic: name; a relative name is in the namespace, an absolute name stays unchanged.
@@ -51,7 +51,7 @@ def read_file_names(folder: Path) -> list[str]:
     """Names of the files of a bag, in order.
 
     Raises:
-        BagError: the metadata are missing, or are not from a bag.
+        BagError: the metadata file is missing, or does not describe a bag.
     """
     path = folder / FILE_NAME
     if not path.is_file():
@@ -77,7 +77,7 @@ def read_file_names(folder: Path) -> list[str]:
 
 
 def quality_of_service(latched: bool) -> list[dict[str, Any]]:
-    """Offered QoS of a topic: reliable; a latched topic is also transient local."""
+    """QoS offered for a topic: reliable, and transient local if the topic is latched."""
     return [
         {
             'history': 'keep_last',

@@ -1,9 +1,9 @@
 """Reads a bag: a rosbag2 folder, or a single .mcap or .db3 file, also compressed with zstd.
 
-Messages are sorted by log time; messages of equal times are in the order of the files. Only the
-chunks of the current time are in memory, never a whole file. Every fault of a bag raises a
-`BagError` with a text of one line. A bag that was cut off by a crash is read up to its last
-complete message, with a warning in the log.
+Messages are sorted by log time; messages with equal log times keep the order of the files. Only the
+chunks that contain the current log time are in memory, never a whole file. Every fault in a bag
+raises a `BagError` with a message of one line. A bag that was cut off by a crash is read up to its
+last complete message, with a warning in the log.
 
     with BagReader('walk') as bag:
         topic = bag.find_topic(['sensor_msgs/msg/CompressedImage'])
@@ -65,7 +65,7 @@ class Topic:
 
     Attributes:
         name: name as in the bag, with or without a leading slash.
-        msgtype: type, for example 'sensor_msgs/msg/Image'; '' if the bag does not contain it.
+        msgtype: type, for example 'sensor_msgs/msg/Image'; '' if unknown.
         encoding: encoding of the messages; 'cdr' for ROS 2.
         message_count: number of messages according to the statistics of the bag.
     """
@@ -108,7 +108,7 @@ class BagMessage:
         """Returns the result of `read` for the message.
 
         Raises:
-            ValueError: the bytes do not match the type, or `read` raises ValueError; the text is
+            ValueError: the bytes do not match the type, or `read` raises ValueError; the message is
                 one line with topic and time.
         """
         message = self.message
@@ -119,7 +119,7 @@ class BagMessage:
             raise ValueError(f'{where}: {error}') from error
 
     def with_message(self, message: Any) -> BagMessage:
-        """Returns a copy with another `rosbags` message, and without bytes."""
+        """Returns a copy that contains the given `rosbags` message and no bytes."""
         kind = message.__msgtype__
         return BagMessage(self.path, self.topic, kind, self.log_time_ns, b'', lambda _: message)
 
@@ -131,7 +131,7 @@ class BagReader(AbstractContextManager['BagReader']):
         path: folder with metadata.yaml, or a file.
 
     Raises:
-        BagError: not a bag, or no part of it can be read.
+        BagError: the path is not a bag, or no part of the bag can be read.
 
     Attributes:
         path: path of the bag, as given.
@@ -196,11 +196,11 @@ class BagReader(AbstractContextManager['BagReader']):
     def topic(self, name: str) -> Topic:
         """The topic with the given name, with or without a leading slash.
 
-        A relative name that does not exist in the root selects the topic of that name in a
-        namespace, if only one namespace has it.
+        A relative name that is missing in the root namespace selects the topic of that name in
+        another namespace, if only one namespace has such a topic.
 
         Raises:
-            BagError: no namespace or several namespaces have such a topic.
+            BagError: there is no topic of that name, or several namespaces have one.
         """
         for candidate in (name, f'/{name}', name.removeprefix('/')):
             if candidate in self.topics:
@@ -217,10 +217,11 @@ class BagReader(AbstractContextManager['BagReader']):
 
         Args:
             msgtypes: accepted types.
-            name: name of the topic, needed if several topics have such a type; None otherwise.
+            name: name of the topic, required if several topics have these types; None otherwise.
 
         Raises:
-            BagError: no such topic, several such topics, another type, or no messages.
+            BagError: there is no such topic or more than one, its type is not accepted, or it has
+                no messages.
         """
         wanted = list(msgtypes)
         short = ' or '.join(msgtype.rpartition('/')[2] for msgtype in wanted)
@@ -254,7 +255,7 @@ class BagReader(AbstractContextManager['BagReader']):
 
         Raises:
             BagError: a topic does not exist, is not CDR, or has two types; or the bag is damaged
-                (raised after the messages before the damage).
+                (raised after the intact messages).
         """
         if topics is None:
             return self._merged(self.topics)
@@ -298,7 +299,8 @@ class BagReader(AbstractContextManager['BagReader']):
                     channel.definition_encoding,
                     channel.definition,
                 )
-            # A bag can compress each message; no CDR message starts with these bytes.
+            # Bags can compress single messages; an uncompressed CDR message never starts with these
+            # bytes.
             if data[:4] == _ZSTD_MAGIC:
                 data = b''.join(_decompressed(data, budget, MAX_CHUNK_BYTES))
             message = deserialise(data, stored.msgtype, store, budget)
@@ -386,7 +388,7 @@ def _decompressed(packed: bytes | BinaryIO, budget: Budget, largest: int) -> Ite
         largest: maximum size of the content, bytes.
 
     Raises:
-        BudgetError: the content exceeds this size or the budget.
+        BudgetError: the content exceeds `largest` or the budget.
     """
     with zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True) as stream:
         while piece := stream.read(_PIECE_BYTES):
@@ -398,7 +400,7 @@ def _decompressed(packed: bytes | BinaryIO, budget: Budget, largest: int) -> Ite
 
 
 def _listed(names: Collection[str]) -> str:
-    """Names as text for an error message."""
+    """Formats names for an error message."""
     more = f' and {len(names) - _MAX_NAMES} more' if len(names) > _MAX_NAMES else ''
     return ', '.join(islice(names, _MAX_NAMES)) + more
 

@@ -1,13 +1,13 @@
-"""Writes messages into a bag that rosbag2 plays, completely or not at all.
+"""Writes a bag that rosbag2 can play, either completely or not at all.
 
 Topics have absolute names, because rosbag2 compares names literally. Relative names are resolved
 in the namespace of the bag, as nodes resolve names. Log time and publish time are both the stamp
 given by the caller.
 
-The bag is written into a hidden folder `.<name>.<random>.partial` next to its place, and moved when
-it is complete and on the disk; an error removes it. If the process is killed, the hidden folder
-remains, and its file can be read except for the last chunk, because chunks are flushed at once.
-Chunks, data and summary have checksums. The same calls write the same bytes.
+The bag is written into a hidden folder `.<name>.<random>.partial` next to its final path, and moved
+there once it is complete and on the disk; after an error it is removed. If the process is killed,
+the hidden folder remains, and its file can be read except for the last chunk, because chunks are
+flushed at once. Chunks, data and summary have checksums. The same calls write the same bytes.
 
     with BagWriter('out') as bag:
         bag.add_topic('body', 'hmt_msgs/msg/Body', latched=True)
@@ -46,7 +46,7 @@ _FOLDER = FolderKind('a bag', FILE_NAME, tuple(f'*{suffix}' for suffix in SUFFIX
 
 
 class _Dropped(Exception):
-    """Raised to remove a new folder instead of moving it to its place."""
+    """Raised to remove a new folder instead of moving it to its final path."""
 
 
 @dataclass
@@ -114,7 +114,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             latched: whether the QoS is transient local: late subscribers get the last message.
 
         Raises:
-            BagError: the type is unknown, or the topic exists.
+            BagError: the type is unknown, or the topic was already added.
         """
         store, name = typestore(), absolute_name(name, self._namespace)
         if msgtype not in store.fielddefs:
@@ -133,7 +133,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self._topics[name] = _Topic(msgtype, channel, offered, type_hash)
 
     def write(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Writes a message of `typestore()`; adds its topic if needed.
+        """Writes a message of `typestore()`; adds the topic if needed.
 
         Raises:
             BagError: the topic has another type, a field is invalid, or the disk is full.
@@ -155,7 +155,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self.write_serialised(topic, stamp_ns, data)
 
     def write_serialised(self, topic: str, stamp_ns: int, data: bytes) -> None:
-        """Writes a message given as CDR bytes; its topic must have been added.
+        """Writes a message given as CDR bytes; the topic must have been added before.
 
         Raises:
             BagError: no such topic, a stamp before 1970, or the disk is full.
@@ -171,16 +171,16 @@ class BagWriter(AbstractContextManager['BagWriter']):
         assert self._file is not None
         with self._dropping_on_error():
             self._writer.add_message(known.channel, stamp_ns, data, stamp_ns)
-            self._file.flush()  # keeps the data if the process is killed
+            self._file.flush()  # so that a killed process loses no data
         known.message_count += 1
         self._start = stamp_ns if self._start is None else min(self._start, stamp_ns)
         self._end = max(self._end, stamp_ns)
 
     def close(self) -> None:
-        """Completes the bag and moves it to its place, unless it is already closed.
+        """Completes the bag and moves it to its final path, unless it is already closed.
 
         Raises:
-            BagError: the disk is full, or the folder exists by now; all files are removed.
+            BagError: the disk is full, or the folder was created meanwhile; all files are removed.
         """
         if self._file is None or self._file.closed:
             return

@@ -38,15 +38,15 @@ from msg_tools.files.budget import Budget, BudgetError
 
 MAGIC = b'\x89MCAP0\r\n'
 
-# Layout of the head of a record (opcode, length), and of the needed fields of some records.
+# Layouts of the header of a record (opcode, length), and of the needed fields of some records.
 _RECORD = struct.Struct('<BQ')
 _MESSAGE = struct.Struct('<HIQQ')
 _CHUNK = struct.Struct('<16xQI')
 _FOOTER = struct.Struct('<B8xQ12x8s')
 _DESCRIPTIONS: dict[int, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: ChannelRecord}
 
-# Maximum size, bytes, of a summary, of a schema or channel, of a run of records outside of chunks,
-# and of all open chunks together; then bytes of memory per byte of a schema or channel.
+# Maximum sizes, bytes: a summary; a schema or channel; a run of records outside of chunks; all open
+# chunks. Then the memory per byte of a schema or channel, bytes.
 _MAX_SUMMARY, _MAX_DESCRIPTION, _MAX_RUN, _MAX_OPEN = 2**25, 2**20, 2**20, 2**28 + 2**27
 _MEMORY_PER_BYTE = 16
 _RECORDS_PER_SKIPPED = 8  # cost of a skipped record in the budget, in records
@@ -57,10 +57,10 @@ class _Index:
     """The index of a file.
 
     Attributes:
-        schemas: schemas by their keys.
-        channels: channels by their keys.
-        chunks: chunks in the order of the file, and runs of records outside of chunks.
-        counts: number of messages of each channel, by its key.
+        schemas: schemas by key.
+        channels: channels by key.
+        chunks: chunks, and runs of records outside of chunks, in the order of the file.
+        counts: number of messages by channel key.
         fault: exception that ended the pass over the file; `EndOfFile` if the end is missing.
     """
 
@@ -71,7 +71,7 @@ class _Index:
     fault: Exception | None = None
 
     def add(self, file: _File, offset: int, end: int, *, bare: bool) -> None:
-        """Adds a chunk, or records outside of chunks, between two offsets of the file."""
+        """Adds the chunk, or the records outside of chunks, between two file offsets."""
         counts: Counter[int] = Counter()
         start, whole = NEVER_NS, 0
         data = file.content(offset, end)
@@ -91,7 +91,7 @@ class _Index:
         except EndOfFile as error:
             raise McapError('a record breaks off') from error
         finally:
-            # Records outside of chunks are kept up to a fault.
+            # Records outside of chunks that precede a fault are kept.
             if counts and (bare or whole == len(data)):
                 length = whole if bare else end - offset
                 self.chunks.append(ChunkIndex(length, offset, '', 0, 0, 0, {}, start, 0))
@@ -109,12 +109,13 @@ class McapFile:
     """A file in the MCAP format.
 
     Args:
-        name: name for messages to the user.
+        name: name of the file in messages to the user.
         budget: budget for opening the bag.
 
     Attributes:
         counts: number of messages of each channel.
-        start: lower bound of the log time of the first message, ns; `NEVER_NS` without messages.
+        start: lower bound of the log time of the first message, ns; `NEVER_NS` if it has no
+            messages.
         cut_off: whether the end of the file is missing.
     """
 
@@ -123,7 +124,7 @@ class McapFile:
         with as_bag_errors(name), path.open('rb') as opened:
             file = _File(opened, budget)
             index = None
-            with suppress(Exception):  # a pass over the file finds the fault
+            with suppress(Exception):  # the pass over the file, below, finds the fault
                 index = _written_index(file)
             self._index = index or _index_of_a_pass(file)
         index = self._index
@@ -144,14 +145,13 @@ class McapFile:
             self.counts[channel] += index.counts[key]
 
     def messages(self, topics: Collection[str], budget: Budget) -> Iterator[StoredMessage]:
-        """Yields messages of the given topics, and time marks, by log time, then by file offset.
+        """Yields messages on the topics, and time marks, sorted by log time and file offset.
 
         Args:
             budget: budget for one pass over the bag.
 
         Raises:
-            BagError: the file is damaged (raised after the messages before the damage), or exceeds
-                the budget.
+            BagError: the file is damaged (raised after the intact messages), or exceeds the budget.
         """
         wanted = {key for key, channel in self._channels.items() if channel.topic in topics}
         with as_bag_errors(self.name), self._path.open('rb') as opened:
@@ -168,7 +168,7 @@ class McapFile:
 
 
 class _File:
-    """An open file during one pass, which is charged to a budget.
+    """An open file; one pass over it is charged to a budget.
 
     Attributes:
         size: size of the file, bytes.
@@ -201,7 +201,7 @@ class _File:
             yield opcode, start, end
 
     def content(self, offset: int, end: int) -> bytes | memoryview:
-        """Decompressed chunk, or records outside of chunks, between two offsets of the file."""
+        """Decompressed chunk, or records outside of chunks, read between two file offsets."""
         if end - offset > MAX_CHUNK_BYTES + _MAX_RUN:
             raise McapError(f'a record of {end - offset} bytes')
         record = memoryview(self.read(offset, end))
@@ -288,7 +288,7 @@ def _written_index(file: _File) -> _Index | None:
         elif isinstance(record, ChunkIndex):
             index.chunks.append(record)
             if record.chunk_start_offset < place:
-                return None  # the same chunk twice
+                return None  # the index lists a chunk twice
             place = record.chunk_start_offset + record.chunk_length
     if statistics is None or place > summary:
         return None

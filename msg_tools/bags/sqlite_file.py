@@ -1,7 +1,7 @@
 """Reads a .db3 file of a bag, the default storage before ROS 2 Iron.
 
-The database is opened read-only, and only its tables are read, because views, virtual tables and
-generated columns could compute endlessly. The number of SQLite steps for queries is limited.
+The database is opened read-only, and only its tables are read, because queries of views, virtual
+tables and generated columns could run endlessly. The number of SQLite steps for queries is limited.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from msg_tools.messages.definitions import MAX_BYTES
 
 MAGIC = b'SQLite format 3\x00'
 
-# Maximum number of steps of SQLite's virtual machine for a file, and additional steps per byte (a
-# row has more than ten bytes and takes approximately thirty steps); steps between two checks;
-# maximum memory of SQLite in the whole process, bytes.
+# Limits of SQLite: steps of its virtual machine for every file, and additional steps per byte of
+# the file (a row has more than ten bytes and takes approximately thirty steps); steps between two
+# checks; memory in the whole process, bytes.
 _STEPS, _STEPS_PER_BYTE, _STEPS_AT_ONCE, _MEMORY = 10**7, 4, 10**5, 2**29
 
 
@@ -47,7 +47,8 @@ class SqliteFile:
         self.counts: Counter[Channel] = Counter()
         self.start = NEVER_NS
         with as_bag_errors(name), _connected(path) as database:
-            # SQLite resolves all views to describe one table, in time exponential in their number.
+            # To describe one table, SQLite resolves all views, in time exponential in the number of
+            # views.
             if _mentions(database, 'view') or _mentions(database, 'virtual'):
                 raise sqlite3.DataError('it has views or virtual tables, wanted tables')
             definitions = {}
@@ -103,7 +104,7 @@ def _connected(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _mentions(database: sqlite3.Connection, word: str) -> bool:
-    """Whether an SQL statement of the schema has a word; the schema's `type` can be forged."""
+    """Searches SQL statements in the schema for a word, because its column `type` can be forged."""
     query = 'SELECT 1 FROM sqlite_master WHERE CAST(sql AS TEXT) LIKE ?'
     return database.execute(query, (f'%{word}%',)).fetchone() is not None
 

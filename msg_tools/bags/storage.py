@@ -12,7 +12,7 @@ from msg_tools.files.budget import BudgetError
 # Maximum size of a message or a chunk, bytes; the largest accepted images have 2**26 pixels.
 MAX_CHUNK_BYTES = 2**28
 NEVER_NS = 2**64  # later than any log time
-MAX_TOPICS = 2**16  # maximum number of topics, summed over the files of a bag; the limit of MCAP
+MAX_TOPICS = 2**16  # maximum number of topics in all files of a bag, as in MCAP
 
 
 class Channel(NamedTuple):
@@ -20,7 +20,7 @@ class Channel(NamedTuple):
 
     Attributes:
         topic: name as in the file, with or without a leading slash.
-        msgtype: type as in the file; '' if the file does not contain it.
+        msgtype: type as in the file; '' if unknown.
         encoding: encoding of the messages; 'cdr' for ROS 2.
         definition_encoding: 'ros2msg' for the text of a .msg file; '' without a definition.
         definition: text of the message definition.
@@ -34,7 +34,7 @@ class Channel(NamedTuple):
 
 
 class StoredMessage(NamedTuple):
-    """A stored message with its log time, ns; without a channel it is only a time mark."""
+    """A stored message with its log time, ns; an entry without a channel is only a time mark."""
 
     log_time: int
     channel: Channel | None

@@ -1,4 +1,4 @@
-"""Decodes videos in bags (H.264 and others, one packet per message) to images.
+"""Decodes the videos in bags (H.264 and similar, one packet per message) to images.
 
 The messages are sensor_msgs/CompressedImage or foxglove_msgs/CompressedVideo. PyAV decodes them; it
 is imported only here, and only if a bag has such a video.
@@ -22,7 +22,7 @@ from msg_tools.messages.message_types import RosbagsMessages
 VIDEO_TYPE = 'foxglove_msgs/msg/CompressedVideo'
 _TYPES = ('sensor_msgs/msg/CompressedImage', VIDEO_TYPE)
 _MAX_WAITING_PACKETS = 32  # maximum number of packets that are not decoded yet
-# Name of the decoder by the format in a message.
+# Maps the format in a message to the name of its decoder.
 _CODECS = {'h264': 'h264', 'h265': 'hevc', 'hevc': 'hevc', 'vp9': 'vp9', 'av1': 'av1'}
 
 
@@ -30,7 +30,7 @@ def is_video(bag: BagReader, topic: Topic) -> bool:
     """Whether the first message of a topic belongs to a video.
 
     Raises:
-        BagError: the message belongs to a video, and PyAV is not installed.
+        BagError: the message belongs to a video, but PyAV is not installed.
     """
     if topic.msgtype not in _TYPES or not topic.message_count:
         return False
@@ -88,7 +88,7 @@ class _Video:
     """The video decoder of a topic.
 
     Attributes:
-        count: number of packets so far.
+        count: number of packets received so far.
         started: whether a key frame was decoded.
     """
 
@@ -100,7 +100,7 @@ class _Video:
         self.count, self.started = 0, False
 
     def pictures(self, stored: BagMessage | None) -> Iterator[BagMessage]:
-        """Decodes a packet and yields the completed pictures; None ends the video."""
+        """Decodes a packet and yields complete pictures; None marks the end of the video."""
         packet = None
         if stored is not None:
             packet = self._av.Packet(np.asarray(stored.message.data, dtype=np.uint8).tobytes())

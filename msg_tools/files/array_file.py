@@ -27,7 +27,7 @@ from msg_tools.files.error_line import error_line
 MAX_ARCHIVE_BYTES = 2**29
 _MAX_ARRAYS = 10_000
 _KINDS = 'biufSU'
-_MIN_VALUE_BYTES = 4  # minimum counted size of a number, bytes
+_MIN_VALUE_BYTES = 4  # smaller numbers count as this size, bytes
 _MAX_EMPTY_SIDE = 10**6  # maximum length of an axis of an array without data
 _HEADER_READERS = {
     (1, 0): array_format.read_array_header_1_0,
@@ -53,7 +53,7 @@ _ARCHIVE_ERRORS = (
 
 
 def read_archive(path: str | Path, largest: int = MAX_ARCHIVE_BYTES) -> dict[str, NDArray[Any]]:
-    """Reads the arrays of an archive, by name.
+    """Reads the arrays of an archive into a dictionary keyed by name.
 
     Args:
         largest: maximum total size of the arrays, bytes.
@@ -61,7 +61,7 @@ def read_archive(path: str | Path, largest: int = MAX_ARCHIVE_BYTES) -> dict[str
     Raises:
         OSError: the file can not be read.
         ValueError: the file is not an archive, is damaged or too large, or contains objects; the
-            text is one line without the path.
+            message is one line without the path.
     """
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
@@ -82,7 +82,7 @@ def read_archive(path: str | Path, largest: int = MAX_ARCHIVE_BYTES) -> dict[str
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, largest: int) -> NDArray[Any]:
-    """Reads an array of an archive; its header is first compared with its number of bytes."""
+    """Reads an array of an archive, after comparing its header with its number of bytes."""
     name, there = member.filename, member.file_size
     with archive.open(member) as file:
         read_head = _HEADER_READERS.get(array_format.read_magic(file))

@@ -1,4 +1,4 @@
-"""Reads untrusted files up to a maximum size, with errors of one line."""
+"""Reads untrusted files up to a maximum size, with one-line error messages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def open_regular(path: str | Path) -> Iterator[BinaryIO]:
     """Opens a regular file for reading, and never blocks on a pipe.
 
     Raises:
-        OSError: the file can not be opened, or is a folder, or is an endless pipe or device.
+        OSError: the file can not be opened, or is a folder, a pipe or a device.
     """
     with open(path, 'rb', opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -31,7 +31,8 @@ def read_bytes(path: str | Path, largest: int) -> bytes:
         largest: maximum size, bytes.
 
     Raises:
-        ValueError: the file can not be read or is too large; the text is one line without the path.
+        ValueError: the file can not be read or is too large; the message is one line without the
+            path.
     """
     try:
         with open_regular(path) as file:

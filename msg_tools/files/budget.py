@@ -10,16 +10,17 @@ from __future__ import annotations
 # Unpacked size allowed for every file, and additional size per byte of the file, bytes. Images of
 # one colour are compressed a thousandfold, camera images and messages rarely tenfold.
 FREE_BYTES, BYTES_PER_BYTE = 2**26, 100
-# Number of records, rows or nodes allowed in every file, and file size per additional one, bytes.
+# Number of records, rows or nodes allowed in every file, and file size per additional record,
+# bytes.
 FREE_RECORDS, BYTES_PER_RECORD = 100_000, 4
 
 
 class BudgetError(ValueError):
-    """A file exceeds its budget, but need not be damaged; the message is one line."""
+    """A file, damaged or not, exceeds its budget; the message is one line."""
 
 
 class Budget:
-    """The remaining bytes and records for the reader of one file.
+    """Bytes and records that the reader of one file may still use.
 
     Args:
         size: size of the file, bytes.

@@ -1,6 +1,6 @@
 """The display matrix of a video in an MP4 or QuickTime file [ISO 14496-12, 8.3.2].
 
-OpenCV gives only an angle, which is wrong if the matrix mirrors.
+OpenCV reports only a rotation angle, which is wrong if the matrix mirrors the image.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def is_turned(matrix: Matrix) -> bool:
 
 
 def shown(image: NDArray[Any], matrix: Matrix) -> NDArray[Any]:
-    """Applies a display matrix to an image (H, W, C), rounded to the nearest quarter turn."""
+    """Applies a display matrix, rounded to the nearest quarter turn, to an image (H, W, C)."""
     across, down = matrix[0], matrix[3]
     if is_turned(matrix):
         across, down = matrix[2], matrix[1]

@@ -11,12 +11,12 @@ MAX_LINE, MAX_TEXT = 300, 250
 
 
 def one_line(text: str, most: int = MAX_TEXT) -> str:
-    """A text without breaks and control characters, of at most `most` characters."""
+    """Converts a text to one line without control characters, of at most `most` characters."""
     return printable(' '.join(_shortened(text, 100 * most).split()), most)
 
 
 def error_line(error: BaseException, most: int = MAX_TEXT) -> str:
-    """The text of an error as one line; the name of its type if the text is empty."""
+    """Message of an error as one line, or the name of its type if the message is empty."""
     return one_line(str(error), most) or type(error).__name__
 
 
@@ -27,6 +27,6 @@ def printable(text: str, most: int = MAX_LINE) -> str:
 
 
 def _shortened(text: str, most: int) -> str:
-    """Cuts out the middle of a long text; errors name the place first and the remedy last."""
+    """Cuts out the middle of a long text; errors begin with the place and end with the remedy."""
     end = most // 3
     return text if len(text) <= most else f'{text[: most - end - 5]} ... {text[-end:]}'

@@ -14,7 +14,7 @@ from msg_tools.files.bounded_file import open_regular
 
 Data: TypeAlias = 'bytes | mmap.mmap'
 
-_MAX_BOXES = 300_000  # maximum number of boxes in a box; videos of hours have up to two per image
+_MAX_BOXES = 300_000  # maximum number of boxes within a box; long videos have up to two per image
 
 
 @contextmanager

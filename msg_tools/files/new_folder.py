@@ -1,8 +1,9 @@
 """Writes folders and files completely or not at all.
 
-They are made in a hidden folder beside the target, `.<name>.<random>.partial`, and then renamed.
-The hidden folder is locked while in use. A hidden folder without a lock is from a killed process,
-and is removed after the next write to the same place. Links are neither replaced nor followed.
+New folders and files are written into a hidden folder next to the target,
+`.<name>.<random>.partial`, and then renamed. The hidden folder is locked while in use. A hidden
+folder without a lock remains from a killed process, and is removed after the next write to the same
+target. Links are neither replaced nor followed.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class FolderKind:
     Attributes:
         what: name of such a folder in messages, for example 'a bag'.
         marker: name of the file that every such folder has.
-        own: patterns for the names of its other files.
+        own: name patterns of all other files in such a folder.
     """
 
     what: str
@@ -75,7 +76,7 @@ class FolderKind:
                 self.check_place(target, overwrite=overwrite)
         finally:
             for folder in missing:
-                with suppress(OSError):  # the new folder is in it
+                with suppress(OSError):  # it contains the new folder
                     folder.rmdir()
 
 
@@ -115,7 +116,7 @@ def _replacement(target: Path, own: Sequence[str]) -> Iterator[Path]:
     """Yields a temporary path for a file or folder, which replaces the target at the end.
 
     Args:
-        own: patterns for the names of the files that this write makes.
+        own: name patterns of the files that are written.
     """
     around = Path(
         tempfile.mkdtemp(prefix=f'.{target.name}.', suffix=_PARTIAL_SUFFIX, dir=target.parent)
@@ -142,7 +143,8 @@ def locked(folder: Path) -> Iterator[bool | None]:
     """Locks a folder, so that other processes see that it is in use.
 
     Yields:
-        Whether the folder was free; None if the file system has no locks, as on some networks.
+        Whether the folder was unlocked before; None if the file system has no locks, as on some
+        network drives.
     """
     descriptor = os.open(folder, os.O_DIRECTORY)
     try:

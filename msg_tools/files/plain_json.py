@@ -1,4 +1,4 @@
-"""Reads untrusted JSON after an estimate of the memory of its values."""
+"""Reads untrusted JSON, after estimating the memory that its values need."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _BYTES_PER_VALUE = {b'[': 104, b'{': 210, b',': 24, b'"': 32}
 
 
 def read_plain_json(path: str | Path, largest: int) -> Any:
-    """Reads the value in a file.
+    """Reads the JSON value in a file.
 
     Args:
         largest: maximum size of the file, bytes.
@@ -27,10 +27,10 @@ def read_plain_json(path: str | Path, largest: int) -> Any:
 
 
 def load_plain_json(content: bytes | str) -> Any:
-    """Parses the value in a text.
+    """Parses the JSON value in a text.
 
     Raises:
-        ValueError: not JSON, nested too deep, or the values need too much memory.
+        ValueError: the text is not JSON, is nested too deeply, or needs too much memory.
     """
     text = content.encode('utf-8', 'surrogatepass') if isinstance(content, str) else content
     needed = len(text) * (2 if text.isascii() else 5)

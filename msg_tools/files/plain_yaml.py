@@ -17,7 +17,7 @@ from msg_tools.files.error_line import error_line
 # Maximum number of nodes; a parser in pure Python takes 50 us per node.
 MAX_NODES = 20_000
 _MAX_DEPTH = 50
-_MAX_NUMBER_LENGTH = 100  # characters; numbers of base 60 take quadratic time
+_MAX_NUMBER_LENGTH = 100  # characters; parsing of numbers in base 60 takes quadratic time
 # Exceptions of constructors for `!!bool x`, `!!int ""`, or `!!timestamp x`.
 _YAML_ERRORS = (
     yaml.YAMLError,
@@ -55,13 +55,13 @@ class _PlainLoader(yaml.SafeLoader):
 
 
 def read_plain_yaml(path: str | Path, largest: int) -> Any:
-    """Reads the document in a file.
+    """Reads the YAML document in a file.
 
     Args:
         largest: maximum size of the file, bytes.
 
     Raises:
-        ValueError: the file can not be read, is too large, or is not plain YAML; the text is one
+        ValueError: the file can not be read, is too large, or is not plain YAML; the message is one
             line without the path.
     """
     content = read_bytes(path, largest)
@@ -72,10 +72,10 @@ def read_plain_yaml(path: str | Path, largest: int) -> Any:
 
 
 def load_plain_yaml(text: str) -> Any:
-    """Parses the document in a text.
+    """Parses the YAML document in a text.
 
     Raises:
-        ValueError: not YAML, or YAML that is not plain; the error is one line.
+        ValueError: the text is not plain YAML; the error message is one line.
     """
     try:
         return yaml.load(text, Loader=_PlainLoader)

@@ -1,7 +1,7 @@
-"""Opens untrusted videos: only containers that contain their images, up to a maximum size.
+"""Opens untrusted videos, but only containers that include all images, up to a maximum size.
 
-FFmpeg also reads lists of other files and addresses, and series of images by a name pattern; these
-are refused.
+FFmpeg also reads lists of files or URLs, and image sequences given by a name pattern; both are
+refused.
 """
 
 from __future__ import annotations
@@ -31,10 +31,11 @@ def open_video(path: Path) -> cv2.VideoCapture:
 
     Raises:
         OSError: the file can not be read.
-        ValueError: another format, a damaged file, or images that are too large.
+        ValueError: unsupported format, damaged file, or images that are too large.
     """
     with mapped(path) as data:
-        # Tables of equal-sized images, and tables of fragments, can claim images without bytes.
+        # Tables of equal-sized images, and tables of fragments, can list images that have no bytes
+        # in the file.
         tables = boxes_at(data, 0, len(data), b'moov', b'trak', b'mdia', b'minf', b'stbl', b'stsz')
         runs = boxes_at(data, 0, len(data), b'moof', b'traf', b'trun')
         counts = chain(((at + 8, end) for at, end in tables), ((at + 4, end) for at, end in runs))

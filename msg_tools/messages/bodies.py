@@ -1,4 +1,4 @@
-"""hmt_msgs/Body, and the body of the poses in a message."""
+"""Makes hmt_msgs/Body, and finds the body of the poses in a message."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from msg_tools.messages.urdf import body_urdf
 
 
 def message_of_body(messages: MessageFactory, body: Body, stamp_ns: int, frame_id: str) -> Any:
-    """hmt_msgs/Body of a body with its current segment lengths.
+    """Makes an hmt_msgs/Body from a body with its current segment lengths.
 
     Args:
-        stamp_ns: stamp of the image that determined the body.
-        frame_id: optical frame of the camera; the root link of the URDF in the message.
+        stamp_ns: stamp of the image from which the body was determined.
+        frame_id: optical frame of the camera, which is also the root link of the URDF in the
+            message.
     """
     return messages.create(
         'hmt_msgs/msg/Body',
@@ -38,10 +39,10 @@ def message_of_body(messages: MessageFactory, body: Body, stamp_ns: int, frame_i
 
 
 def resized(model: Body, segment_lengths: Mapping[str, float]) -> Body:
-    """A body model with the segment lengths of a message, m; empty keeps the model's lengths.
+    """A body model with the segment lengths of a message, m, or its own if the message has none.
 
     Raises:
-        MessageError: a length of an unknown segment, or one that is not finite.
+        MessageError: a segment is unknown, or a length is not finite.
     """
     try:
         return model.with_segment_lengths(segment_lengths)
@@ -57,10 +58,10 @@ def body_of(
     Messages of other publishers may have no lengths; the model then keeps its own lengths.
 
     Args:
-        any_name: whether to accept a message with another name of the model.
+        any_name: whether to accept a message that names a different model.
 
     Raises:
-        MessageError: a mixture of another model, or of other degrees of freedom.
+        MessageError: the mixture has a different model or different degrees of freedom.
     """
     name = content.body_model
     if name not in ('', model.name) and not any_name:
@@ -74,7 +75,8 @@ def description_message(
 ) -> Any:
     """std_msgs/String with the URDF of a body, for viewers.
 
-    Its links are the frames of the transforms: the root is `frame_id`, all others have the prefix.
+    The links are named like the frames of the transforms: the root link is `frame_id`, and all
+    other names have the prefix.
     """
     return messages.create(
         'std_msgs/msg/String',

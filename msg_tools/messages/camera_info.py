@@ -1,7 +1,7 @@
 """Converts sensor_msgs/CameraInfo to a camera and back.
 
-The calibration in the message is for the full sensor. The picture may show a part of it (roi), and
-that part may be binned: a pixel u of the sensor is at (u - roi.x_offset) / binning_x in the
+The calibration in the message is for the full sensor. The picture may show only a part of the
+sensor (roi), and may be binned: a pixel u of the sensor is at (u - roi.x_offset) / binning_x in the
 picture, the convention of image_geometry.
 """
 
@@ -18,10 +18,10 @@ from hmt_ros.body.camera import unfolded_share
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_types import MessageFactory
 
-# Number of coefficients per model in a message; without distortion all are 0.
+# Number of distortion coefficients by model; without distortion all are 0.
 _COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
-# Other names of the models. The model of a pinhole follows from the number of coefficients, as in
-# OpenCV.
+# Synonyms for the models. The distortion model of a pinhole camera follows from the number of
+# coefficients, as in OpenCV.
 _PINHOLE = ('pinhole', 'perspective', 'none')
 _ALIASES = {
     'radtan': 'plumb_bob',
@@ -32,7 +32,7 @@ _ALIASES = {
     'kannala_brandt': 'equidistant',
     'kannala_brandt4': 'equidistant',
 }
-# Maximum skew that is ignored, in focal lengths; it shifts the border by up to about 2 px.
+# Maximum skew that is ignored, in focal lengths; it moves image borders by up to about 2 px.
 _MAX_SKEW = 0.01
 
 # Limits of a valid calibration: ratio of focal lengths and principal point to the size of the
@@ -42,11 +42,11 @@ _MAX_COEFFICIENT = 1e6
 
 
 class CameraInfoError(ValueError):
-    """A camera info is invalid; the text is one line with the value seen and the value wanted."""
+    """A camera info is invalid; the message is one line with the actual and the required value."""
 
 
 class UncalibratedError(CameraInfoError):
-    """A camera info is from a camera without calibration."""
+    """The camera of a camera info is not calibrated."""
 
 
 def camera_from_info(
@@ -58,13 +58,13 @@ def camera_from_info(
 
     Args:
         message: sensor_msgs/CameraInfo, of `rosbags` or of ROS.
-        image_size: (width, height) of the pictures, px; a calibration for another size with the
-            same aspect ratio is scaled.
+        image_size: (width, height) of the pictures, px; a calibration for a different size is
+            scaled if the aspect ratio is the same.
         notify: called with a line of text for each approximation.
 
     Raises:
-        CameraInfoError: not calibrated, values that are not finite or contradict each other, or an
-            unknown distortion model.
+        CameraInfoError: the camera is not calibrated, values are not finite or are inconsistent, or
+            the distortion model is unknown.
     """
     k = [float(value) for value in message.k]
     d = [float(value) for value in message.d]

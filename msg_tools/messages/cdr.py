@@ -4,8 +4,8 @@ CDR does not define the values of padding bytes; the ROS 2 middleware leaves old
 them, and `rclpy.serialization.serialize_message` even appends bytes after an empty sequence.
 `serialise` writes zeros into the padding and nothing after the message, so that equal messages have
 equal bytes. A node that publishes these bytes (`Publisher.publish` accepts them) sends and records
-the same bytes as an offline run writes. The middleware only appends bytes up to a multiple of four,
-which `canonical` removes.
+the same bytes as an offline run writes. The middleware only pads the bytes to a multiple of four;
+`canonical` removes this padding.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from msg_tools.messages.definitions import Extent, extent_of
 from msg_tools.messages.message_types import typestore
 
 _HEADER_BYTES = 4
-# Maximum number of values of a message (up to 100 bytes and 1 us each), and number of values that
-# cost one record of the budget.
+# Maximum number of values in a message (each takes up to 100 bytes and 1 us), and number of values
+# that are charged as one record of the budget.
 MAX_VALUES, _VALUES_PER_RECORD = 4_000_000, 16
 
 
@@ -46,8 +46,8 @@ def deserialise(
         data: CDR bytes with encapsulation header, in either byte order.
         msgtype: type, for example 'hmt_msgs/msg/Body'.
         types: types that include `msgtype`; None selects `typestore()`.
-        budget: budget of the file that contains the bytes, because a few untrusted bytes can claim
-            to be many messages, each of which becomes an object.
+        budget: budget of the file that contains the bytes, because a few untrusted bytes can
+            declare many nested messages, which all become objects.
 
     Raises:
         Exception: the bytes are not a message of this type; any class of exception is possible.

@@ -1,8 +1,8 @@
 """Reads untrusted message definitions in the .msg language of ROS 2.
 
-Only names and types of fields are read, because CDR needs no more; constants, defaults and comments
-are skipped. The time is linear in the length of the text. Definitions that are too large are
-refused before code is generated from them.
+Only names and types of fields are read, because CDR needs nothing else; constants, defaults and
+comments are skipped. The time is linear in the length of the text. Definitions that are too large
+are refused before code is generated from them.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ def types_of_definition(text: str, msgtype: str) -> Types:
     """The types in a definition, including the nested types that follow it.
 
     Args:
-        msgtype: type with its package.
+        msgtype: name of the type, with its package.
 
     Raises:
-        ValueError: the text is too long or invalid; the error is one line.
+        ValueError: the text is too long or invalid; the error message is one line.
     """
     if len(text) > MAX_BYTES:
         raise ValueError(f'its definition has more than {MAX_BYTES} characters')
@@ -67,7 +67,7 @@ def check_types(types: Types, known: Mapping[str, Any]) -> None:
     """Raises ValueError (one line) if types are too large or can not be used.
 
     Args:
-        known: types for nested fields, by name; the second item of each is its fields.
+        known: types of nested fields, by name; the second item of each type lists its fields.
     """
     fields = [kind for each in types.values() for _, kind in each]
     if len(types) + len(fields) > MAX_FIELDS:
@@ -87,12 +87,12 @@ def check_types(types: Types, known: Mapping[str, Any]) -> None:
 
 
 class Extent(NamedTuple):
-    """Minimum extent of a field, with all its sequences empty.
+    """Minimum size of a field, which it has if all its sequences are empty.
 
     Attributes:
-        values: number of values, each a Python object; an array of numbers is one value.
+        values: number of Python objects; an array of numbers is one object.
         size: size, bytes.
-        density: maximum number of values per byte in its sequences.
+        density: maximum number of values per byte in the sequences of the field.
         levels: number of levels of nested messages.
     """
 
@@ -105,15 +105,15 @@ class Extent(NamedTuple):
 def extent_of(
     description: Any, types: Mapping[str, Any], extents: dict[str, Extent], level: int = 0
 ) -> Extent:
-    """Computes the extent of a field, given in the description of `rosbags`.
+    """Computes the extent of a field, given as `rosbags` describes it.
 
     Args:
-        types: types by name; the second item of each is its fields.
+        types: types by name; the second item of each type lists its fields.
         extents: known extents by type; new extents are added.
         level: number of messages in which the field is nested.
 
     Raises:
-        ValueError: an unknown type, or one that is nested too deeply, for example in itself.
+        ValueError: a type is unknown, or is nested too deeply, for example in itself.
     """
     kind, detail = description
     if kind == Nodetype.BASE:
@@ -140,7 +140,7 @@ def extent_of(
 
 
 def _full_name(name: str, owner: str) -> str:
-    """Full name of a type, as in `rosbags`, from its name in a field of another type."""
+    """Full name, as in `rosbags`, of a type that a field of another type refers to."""
     *package, last = _ALIASES.get(name, name).split('/')
     if not package:
         return f'{owner.rpartition("/")[0]}/{last}'
@@ -155,7 +155,7 @@ def _described(
 
     Args:
         longest: maximum number of characters of a string.
-        bounded: whether the count is the maximum length of a sequence.
+        bounded: whether `count` is the maximum length of a sequence.
         count: length of an array; empty for a sequence, None for a single value.
     """
     if kind == 'string' or kind in SIZEMAP:

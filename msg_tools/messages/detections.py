@@ -2,7 +2,8 @@
 
 - hmt_msgs/People2D: people with keypoints of any names, boxes, or both, with or without an id.
 - hri_msgs/Skeleton2D (REP 155): one person, 18 landmarks in units of image width and height.
-- yolo_msgs/DetectionArray (yolo_ros): people with an id and landmarks, numbered from 1.
+- yolo_msgs/DetectionArray (yolo_ros): people with an id and landmarks; the landmarks are numbered
+  from 1.
 - std_msgs/Float32MultiArray: rows (u, v) or (u, v, confidence), px, of one person; several people
   have an additional outermost dimension. The label of the outermost dimension can be the image
   stamp, ns.
@@ -32,7 +33,7 @@ SKELETON_2D, YOLO = 'hri_msgs/msg/Skeleton2D', 'yolo_msgs/msg/DetectionArray'
 FLOATS = 'std_msgs/msg/Float32MultiArray'
 PEOPLE_2D, BOXES = 'hmt_msgs/msg/People2D', 'vision_msgs/msg/Detection2DArray'
 REGION = 'sensor_msgs/msg/RegionOfInterest'
-# Classes of people in vision_msgs detections: names in data sets, and the number in COCO.
+# Class labels of people in vision_msgs detections: names from data sets, and COCO's number.
 PERSON_CLASSES = ('person', 'people', 'human', 'pedestrian', '0', '')
 # Maximum number of people in one image.
 MAX_PEOPLE = 1000
@@ -46,7 +47,7 @@ class DetectedPerson(NamedTuple):
     """A person in an image.
 
     Attributes:
-        name: identity from the detector; '' if it gives none.
+        name: identity from the detector; '' if unknown.
         keypoints: landmarks under the names of their scheme; empty if there is only a box.
         box: (left, top, right, bottom) px; None if unknown.
     """
@@ -74,7 +75,7 @@ def person_of_skeleton(message: Any, width: int, height: int) -> DetectedPerson:
         width, height: size of the image, px.
 
     Raises:
-        MessageError: another number of landmarks, or invalid positions.
+        MessageError: wrong number of landmarks, or invalid positions.
     """
     scheme = schemes()['skeleton2d']
     wanted = len(scheme.names)
@@ -169,11 +170,11 @@ def people_of_yolo(message: Any, scheme: Scheme) -> list[DetectedPerson]:
     """The people with keypoints in a yolo_msgs/DetectionArray.
 
     Args:
-        scheme: scheme in whose order the keypoints are numbered.
+        scheme: keypoint scheme that defines the numbers of the keypoints.
 
     Raises:
-        MessageError: a keypoint number that the scheme lacks, a number that occurs twice, or
-            invalid positions.
+        MessageError: a keypoint number is unknown to the scheme or occurs twice, or positions are
+            invalid.
     """
     _check_count(len(message.detections))
     people = []
@@ -201,12 +202,12 @@ def people_of_floats(message: Any, scheme: Scheme) -> list[DetectedPerson]:
     """The people in a std_msgs/Float32MultiArray.
 
     Args:
-        message: array (n, 2), (n, 3), (people, n, 2) or (people, n, 3); without dimensions it is
-            one person. An empty array means that nobody was seen.
+        message: array (n, 2), (n, 3), (people, n, 2) or (people, n, 3); an array without dimensions
+            is one person. An empty array means that nobody was seen.
         scheme: scheme with n landmarks, in the order of the rows.
 
     Raises:
-        MessageError: another shape, or invalid positions.
+        MessageError: unsupported shape, or invalid positions.
     """
     n = len(scheme.names)
     data = np.array(message.data, dtype=np.float64)[int(message.layout.data_offset) :]

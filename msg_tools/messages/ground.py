@@ -30,10 +30,10 @@ class GroundState:
         up_sigma: standard deviation of the direction of `up`, rad; NaN if unknown.
         height: height of the camera above the floor, m; None if unknown.
         height_sigma: standard deviation of the height, m; NaN if unknown.
-        contacts: probability that a foot is on the floor, by its name, for example left_foot.
+        contacts: probability of floor contact by name of the foot, for example left_foot.
 
     Raises:
-        MessageError: values that contradict each other or are out of range.
+        MessageError: values are inconsistent or out of range.
     """
 
     stamp_ns: int
@@ -87,7 +87,7 @@ def ground_of(message: Any) -> GroundState:
     """Reads an hmt_msgs/Ground message of `rosbags` or of ROS.
 
     Raises:
-        MessageError: values that contradict each other or are out of range.
+        MessageError: values are inconsistent or out of range.
     """
     names = names_of(message.contact_names, 'ground: contacts')
     probabilities = numbers(

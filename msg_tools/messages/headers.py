@@ -1,4 +1,4 @@
-"""Times in nanoseconds and headers."""
+"""Converts times in nanoseconds, and headers."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def time_ns(time: Any) -> int:
 
 def stamp_in(data: bytes) -> int:
     """Stamp, ns, of the header at the start of a message in CDR bytes; 0 if invalid."""
-    # After the encapsulation, whose second byte gives the byte order.
+    # The message follows a header of four bytes; the second byte gives the byte order.
     if len(data) < _STAMP_OFFSET + _STAMP_SIZE:
         return 0
     order = '<' if data[1] & 1 else '>'

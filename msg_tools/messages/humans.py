@@ -33,8 +33,8 @@ REACH = 0.12
 # Rotation from the axes of the head's landmarks (x to the person's right, y backwards, z down) to
 # the axes of the reference model.
 _LANDMARKS_TO_HEAD = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-# Maximum difference of a landmark, or of a side of the region, between modes that agree, in heights
-# of the region.
+# Maximum distance of landmarks, or of sides of regions, at which two modes agree, in heights of the
+# region.
 _AGREEMENT_DISTANCE = 0.1
 
 
@@ -77,9 +77,9 @@ def region_message(
 
     Args:
         region: (4,) region of the shown mode, see `region_in_image`.
-        others: K regions, of all modes.
-        weights: (K,) weights of the modes. The confidence is the sum of the weights of modes whose
-            sides differ by at most a tenth of the region's height from the shown sides.
+        others: regions of all K modes.
+        weights: (K,) weights of the modes. The confidence is the total weight of the modes whose
+            region agrees with the shown region: no side differs by more than a tenth of its height.
     """
     near = _AGREEMENT_DISTANCE * (region[3] - region[1])
     agree = [other is not None and np.abs(other - region).max() <= near for other in others]
@@ -137,8 +137,8 @@ def landmarks_in_space(
 ) -> Array:
     """Landmarks (K, 18, 3) of Skeleton2D in the frame of the joint positions (K, J, 3), m.
 
-    Landmarks of limbs are their joints. Nose and ears have the offsets from the head that detectors
-    give them, rotated like the head of the reference model. Eyes are unknown, NaN.
+    Landmarks of limbs are at the joints. Nose and ears are at fixed offsets from the joint of the
+    head, rotated like the head of the reference model. Eyes are unknown, NaN.
     """
     marks = schemes()['skeleton2d'].landmarks
     names, rotations, _ = human.links()
@@ -187,7 +187,7 @@ def human_transforms(
     """tf2_msgs/TFMessage with the body relative to the camera, and the links relative to the body.
 
     Args:
-        links: whether to send the links too, or only the body.
+        links: whether to include the links, not only the body.
     """
     root = f'body_{body_id}'
     names, rotations, places = (
@@ -204,7 +204,7 @@ def human_transforms(
 
 
 def human_urdf(human: ReferenceHuman, body_id: str, rod_radius: float = 0.03) -> str:
-    """The reference model with the lengths of a person as a URDF; names end with the identity.
+    """URDF of the reference model with the lengths of a person; names end with the identity.
 
     All angles have the range [-pi, pi], because people exceed the narrower ranges of the reference.
     """

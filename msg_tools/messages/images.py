@@ -52,17 +52,17 @@ _PNG_PIXELS_PER_BYTE = 8 * 1032
 # Number of pixels allowed in every file, and additional pixels per byte of the file. Otherwise
 # small files of one colour could occupy a reader for minutes.
 FREE_PIXELS, _PIXELS_PER_BYTE = 2**24, 16
-# Maximum size of a PNG, bytes: a part per pixel (four incompressible channels of 16 bits), and a
+# Maximum size of a PNG, bytes: a part per pixel (four incompressible channels of 16 bits), plus a
 # constant. Surplus data would be inflated, too.
 _PNG_BYTES_PER_PIXEL, _PNG_BYTES = 9, 10_000
 
 
 class ImageError(ValueError):
-    """A picture can not be decoded; the text is one line with the values seen and wanted."""
+    """A picture can not be decoded; the message is one line with actual and required values."""
 
 
 # Encoding: (dtype, channels, conversion to BGR or None). OpenCV names Bayer patterns after the
-# second row and column: its BG is rggb.
+# second row and column: BG in OpenCV is rggb in ROS.
 _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     'mono8': ('u1', 1, cv2.COLOR_GRAY2BGR),
     '8UC1': ('u1', 1, cv2.COLOR_GRAY2BGR),
@@ -98,7 +98,7 @@ _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     'nv21': ('u1', 1, cv2.COLOR_YUV2BGR_NV21),
 }
 _MASKS = ('mono8', '8UC1')
-# Encodings with chroma after the picture, in half as many rows.
+# Encodings in which chroma follows luma, in half as many rows.
 _PLANAR = ('nv12', 'nv21', 'yuv420', 'i420', 'yv12')
 # Encodings with two separate chroma planes, in rows of half the width.
 _THREE_PLANES = ('yuv420', 'i420', 'yv12')
@@ -115,7 +115,7 @@ def decode_image(message: Any) -> Picture:
     The orientation in a JPEG is ignored, because the calibration is for the stored picture.
 
     Raises:
-        ImageError: unknown encoding, contradictory sizes, or bytes that are not a picture.
+        ImageError: unsupported encoding, inconsistent size, or bytes that are not a picture.
     """
     if hasattr(message, 'encoding'):
         return _decode_raw(message)
@@ -182,7 +182,7 @@ def decode_mask(message: Any) -> Mask:
     and changes zeros.
 
     Raises:
-        ImageError: another encoding, contradictory sizes, or bytes that are not a picture.
+        ImageError: unsupported encoding, inconsistent size, or bytes that are not a picture.
     """
     if hasattr(message, 'encoding'):
         encoding = str(message.encoding)
@@ -213,11 +213,11 @@ def decode_picture(
     The size in the header of the file is checked before decoding.
 
     Args:
-        form: claimed format, for error messages.
+        form: declared format, for error messages.
         colours: flag of OpenCV for the channels of the picture.
 
     Raises:
-        ImageError: another format, a damaged file, more pixels than `MAX_PIXELS`, or too many
+        ImageError: unsupported format, damaged file, more pixels than `MAX_PIXELS`, or too many
             pixels for the size of the file.
     """
     if content.startswith(b'\xff\xd8\xff'):
@@ -248,7 +248,7 @@ def decoded(content: bytes, flags: int = cv2.IMREAD_COLOR) -> Picture:
     """Decodes a picture in any format of OpenCV.
 
     Raises:
-        ImageError: another format, or a damaged file.
+        ImageError: unsupported format, or a damaged file.
     """
     try:
         image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
@@ -324,7 +324,7 @@ def encode_jpeg(image: NDArray[np.uint8], quality: int = 90) -> bytes:
     """Encodes a picture, BGR (H, W, 3) or grey (H, W), as JPEG; equal pictures give equal bytes.
 
     Raises:
-        ImageError: not a picture.
+        ImageError: the array is not a picture.
     """
     _check_picture(image)
     done, encoded = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, quality])
@@ -364,10 +364,10 @@ def image_message(
 
 
 def decode_depth(message: Any) -> Depth:
-    """The depths (H, W) of a sensor_msgs/Image, m, float32; 0 or NaN without measurement.
+    """Depths (H, W) in a sensor_msgs/Image, m, float32; 0 or NaN where no depth was measured.
 
     Raises:
-        ImageError: another encoding, or contradictory sizes.
+        ImageError: unsupported encoding, or inconsistent size.
     """
     encoding = str(message.encoding)
     if encoding not in _DEPTH_ENCODINGS:
@@ -385,7 +385,7 @@ def depth_message(
     """sensor_msgs/Image of depths (H, W): 16UC1 for uint16 in mm, 32FC1 for float32 in m.
 
     Raises:
-        ImageError: an array of another shape or type.
+        ImageError: unsupported shape or type of the array.
     """
     encoding = {'uint16': '16UC1', 'float32': '32FC1'}.get(depth.dtype.name)
     if encoding is None or depth.ndim != 2 or not depth.size:

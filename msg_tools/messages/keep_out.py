@@ -59,7 +59,7 @@ class KeepOut:
         reason: reason why the state is unknown; '' if it is known.
 
     Raises:
-        MessageError: values that contradict each other or are out of range.
+        MessageError: values are inconsistent or out of range.
     """
 
     stamp_ns: int
@@ -109,7 +109,7 @@ def keep_out_of(message: Any) -> KeepOut:
     """Reads an hmt_msgs/KeepOut message of `rosbags` or of ROS.
 
     Raises:
-        MessageError: values that contradict each other or are out of range.
+        MessageError: values are inconsistent or out of range.
     """
     n = len(message.radii)
     flat = {

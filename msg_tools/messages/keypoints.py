@@ -26,7 +26,7 @@ from msg_tools.messages.message_types import MessageFactory
 KEYPOINTS_2D, KEYPOINTS_3D = 'hmt_msgs/msg/Keypoints2D', 'hmt_msgs/msg/Keypoints3D'
 # Maximum number of keypoints of one person; detectors find up to a few hundred.
 MAX_KEYPOINTS = 10_000
-# Maximum coordinates of a person: px from the first pixel, and m from the origin.
+# Maximum coordinates of keypoints: in the image, px from the first pixel; in 3D, m from the origin.
 MAX_PIXEL, MAX_POSITION = 1e6, 1e3
 
 
@@ -43,7 +43,7 @@ class Positions:
     positions: Array
 
     def added_to(self, keypoints: Keypoints) -> Keypoints:
-        """Adds positions to the keypoints of the same names; others get NaN."""
+        """Adds positions to keypoints by name; keypoints without a position get NaN."""
         places = {name: i for i, name in enumerate(self.names)}
         positions = np.full((len(keypoints.names), 3), np.nan)
         for i, name in enumerate(keypoints.names):
@@ -63,7 +63,7 @@ def keypoints_of(message: Any, sigma_px: float = 0.0) -> Keypoints:
         Unknown covariances are NaN.
 
     Raises:
-        MessageError: a name that occurs twice, contradictory lengths of arrays, a position far
+        MessageError: a name that occurs twice, inconsistent lengths of arrays, a position far
             outside of any image or with only one coordinate, a covariance that is not positive
             definite, or a confidence outside of [0, 1].
     """
@@ -149,7 +149,7 @@ def keypoints_message(
 def positions_message(
     messages: MessageFactory, keypoints: Keypoints, stamp_ns: int, frame_id: str
 ) -> Any:
-    """Makes an hmt_msgs/Keypoints3D of keypoints; it is empty if they have no positions."""
+    """Makes an hmt_msgs/Keypoints3D of keypoints; without 3D positions the message is empty."""
     names, positions = list(keypoints.names), keypoints.positions
     confidences = keypoints.confidences
     if positions is None:

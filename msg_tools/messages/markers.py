@@ -5,7 +5,8 @@ the joints; lighter modes are fainter. A viewer thus replaces earlier markers. E
 all ranks, and deletes the markers of unused ranks.
 
 The floor is a translucent square in the namespace `floor`. Feet on the floor are spheres in the
-namespace `contacts`; less probable contacts are fainter. Markers of unknown objects are deleted.
+namespace `contacts`; less probable contacts are fainter. The markers of an unknown floor and of
+unknown contacts are deleted.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ _ADD, _DELETE = 0, 2
 _CUBE, _LINE_LIST, _SPHERE_LIST = 1, 5, 7
 _BONES, _JOINTS = 0, 1
 
-# The heaviest mode is orange, the others are blue, which colour-blind people can distinguish.
+# The heaviest mode is orange and all other modes blue; colour-blind people can distinguish both.
 _FIRST_COLOUR = (0.90, 0.45, 0.05)
 _OTHER_COLOUR = (0.10, 0.45, 0.80)
 _MIN_OPACITY = 0.12
 
 FLOOR, CONTACTS = 'floor', 'contacts'
-# Side and thickness of the floor marker, m; its top is the floor.
+# Side and thickness of the floor marker, m; the top of the marker is the floor.
 _FLOOR_SIDE, _FLOOR_THICKNESS = 3.0, 0.005
 _FLOOR_COLOUR = (0.55, 0.55, 0.50), 0.30
 _CONTACT_COLOUR = (0.00, 0.62, 0.45)
@@ -65,11 +66,11 @@ def skeleton_markers(
         joint_positions: (K, J, 3) joint positions, m.
         edges: bones, as pairs of joint names.
         weights: (K,) weights of the modes, in any order.
-        ranks: maximum number of shown modes; the lightest are left out.
+        ranks: maximum number of shown modes; lighter modes are left out.
         bone_width, joint_diameter: width of bones and diameter of joints, m.
 
     Raises:
-        MessageError: contradictory shapes of arrays, or an edge with an unknown joint.
+        MessageError: inconsistent array shapes, or an edge with an unknown joint.
     """
     positions = np.asarray(joint_positions, dtype=np.float64)
     heavy = np.asarray(weights, dtype=np.float64)
@@ -117,11 +118,11 @@ def trajectory_markers(
         traced: joints whose paths are drawn; unknown names are ignored.
         edges: bones, as pairs of joint names.
         weights: (M,) weights of the trajectories, in any order.
-        ranks: maximum number of shown trajectories; the lightest are left out.
+        ranks: maximum number of shown trajectories; lighter trajectories are left out.
         line_width: width of lines, m.
 
     Raises:
-        MessageError: contradictory shapes of arrays, or an edge with an unknown joint.
+        MessageError: inconsistent array shapes, or an edge with an unknown joint.
     """
     positions = np.asarray(joint_positions, dtype=np.float64)
     heavy = np.asarray(weights, dtype=np.float64)

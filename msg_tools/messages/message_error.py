@@ -20,7 +20,7 @@ SYMMETRY_TOLERANCE = 1e-9
 
 
 class MessageError(ValueError):
-    """A message is invalid; the text is one line with the value seen and the value wanted.
+    """A message is invalid; the text is one line with the actual and the required value.
 
     Attributes:
         fault: kind of the fault, in a word or two.
@@ -35,7 +35,7 @@ def numbers(values: Any, shape: tuple[int, ...], what: str) -> Array:
     """Converts a flat field of a message to an array of floats with a given shape.
 
     Raises:
-        MessageError: another number of values.
+        MessageError: wrong number of values.
     """
     array = np.array(values, dtype=np.float64)
     count = math.prod(shape)
@@ -61,13 +61,13 @@ def complete_mixture(record: Any, what: str) -> None:
 def freeze_arrays(
     record: Any, shapes: Mapping[str, tuple[int, ...]], what: str, optional: Sequence[str] = ()
 ) -> None:
-    """Makes attributes of a frozen dataclass read-only arrays of floats, and checks their shapes.
+    """Converts attributes of a frozen dataclass to read-only float arrays of the given shapes.
 
     Args:
         optional: names of attributes for which None is allowed.
 
     Raises:
-        MessageError: an array has another shape.
+        MessageError: an array has a wrong shape.
     """
     for name, shape in shapes.items():
         value = getattr(record, name)
@@ -90,7 +90,7 @@ def identities_of(values: NDArray[Any] | None, count: int, what: str) -> NDArray
     """Read-only identities (count,) of components; None gives zeros.
 
     Raises:
-        MessageError: another number of identities.
+        MessageError: wrong number of identities.
     """
     result = np.array(np.zeros(count) if values is None else values, dtype=np.uint32)
     if result.shape != (count,):
@@ -110,7 +110,7 @@ def constant_of(kind: type[Constant], value: Any, fault: str) -> Constant:
     """The member of an enumeration with a given value.
 
     Args:
-        fault: text of the error.
+        fault: error message.
 
     Raises:
         MessageError: no member has the value.
@@ -163,7 +163,7 @@ def check_covariances(covariances: Array, what: str, *, singular: bool = False) 
 
 
 def names_of(values: Sequence[str], what: str) -> tuple[str, ...]:
-    """Names as a tuple.
+    """Converts names to a tuple, and checks that they are distinct.
 
     Raises:
         MessageError: a name that occurs twice.
@@ -176,7 +176,7 @@ def names_of(values: Sequence[str], what: str) -> tuple[str, ...]:
 
 
 def check_names(names: tuple[str, ...], wanted: Sequence[str] | None, what: str) -> None:
-    """Raises MessageError if names or their order are not as wanted; None accepts any names."""
+    """Raises MessageError if names or their order differ from `wanted`; None accepts any names."""
     if wanted is None or names == tuple(wanted):
         return
     if len(names) != len(wanted):
@@ -189,7 +189,7 @@ def array_of_each(components: Sequence[Any], name: str, shape: tuple[int, ...], 
     """A flat field of K components as an array (K, *shape).
 
     Raises:
-        MessageError: another number of values.
+        MessageError: wrong number of values.
     """
     values, count = [getattr(component, name) for component in components], math.prod(shape)
     for k, own in enumerate(values):
@@ -202,10 +202,10 @@ def array_of_each(components: Sequence[Any], name: str, shape: tuple[int, ...], 
 def array_of_all(
     components: Sequence[Any], name: str, shape: tuple[int, ...], what: str
 ) -> Array | None:
-    """A field (K, *shape) of all components; None if no component has it.
+    """A flat field of K components as an array (K, *shape); None if it is empty in all of them.
 
     Raises:
-        MessageError: only some components have it, or another number of values.
+        MessageError: only some components have the field, or it has a wrong number of values.
     """
     lengths = [len(getattr(component, name)) for component in components]
     if not any(lengths):
@@ -227,7 +227,7 @@ def lengths_of(message: Any, what: str) -> dict[str, float]:
 
 
 def named_numbers(message: Any, names: str, values: str, what: str) -> dict[str, float]:
-    """The numbers in one field of a message, by the names in another field; both can be empty.
+    """Maps names in one field of a message to numbers in another field; both can be empty.
 
     Raises:
         MessageError: a name that occurs twice, or different numbers of values and names.

@@ -62,10 +62,10 @@ def register_definitions(package: str, folder: Path) -> None:
 
 
 def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typestore:
-    """Types for messages that have their own definition, such as messages of a bag.
+    """Types for messages that come with their definition, such as messages of a bag.
 
-    A bag may contain unknown types, or an older version of a known type; its messages must be read
-    with its own definition.
+    A bag may contain unknown types, or older versions of known types; its messages must be read
+    with the definitions in the bag.
 
     Args:
         msgtype: type, for example 'sensor_msgs/msg/Image'.
@@ -123,7 +123,7 @@ def _same_fields(name: str, types: Types, known: Typestore) -> bool:
 
 
 def adopted(value: Any, types: Typestore) -> Any:
-    """Converts a message that has an older definition to its type in `typestore()`.
+    """Converts a message, read with an older definition, to its type in `typestore()`.
 
     Missing fields are zero or empty.
 

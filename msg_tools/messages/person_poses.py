@@ -2,12 +2,12 @@
 
 geometry_msgs/PoseWithCovarianceStamped gives the direction that a person faces. The frame of a
 person has its origin in the pelvis, x forward, y left, z towards the head (REP 103). The pose is
-from the heaviest component, and the covariance is that of the mixture about this pose,
+that of the heaviest component. The covariance is the second moment of the mixture about this pose:
 
     S = sum_k w_k (S_k + e_k e_k'),    e_k = (p_k - p_0, log R_k R_0')
 
-so that it is large if the components disagree. Rotations are about the fixed axes of the frame of
-the header, as the message defines them.
+It is large if the components disagree. Rotations are about the fixed axes of the frame of the
+header, as the message defines them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from msg_tools.messages.states import pose_message, quaternions
 
 PERSON_POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
-# Axes of the frame of a person, as columns in the frame of the pelvis: x right, y forward, z up.
+# Axes of the person frame as columns, in the frame of the pelvis (x right, y forward, z up).
 _PERSON_IN_PELVIS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 

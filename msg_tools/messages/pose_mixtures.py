@@ -45,7 +45,7 @@ from msg_tools.messages.message_types import MessageFactory
 POSE_MIXTURE = 'hmt_msgs/msg/PoseMixture'
 # Maximum number of components; a message with millions would block its reader.
 MAX_COMPONENTS = 1024
-# Optional arrays of likelihoods, and optional arrays of joints.
+# Optional fields of `PoseMixture`: arrays of likelihoods, and arrays of joints.
 LIKELIHOOD_ARRAYS = ('shape_covariance', 'posterior_weights', 'ancestry')
 JOINT_ARRAYS = ('joint_covariances', 'joint_covariances_relative', 'joint_velocities')
 
@@ -79,14 +79,14 @@ class PoseMixture:
         means: (K, d) poses, m and rad.
         covariances: (K, d, d) covariances, positive definite; None if unknown.
         body_model: name of the body model.
-        dof_names: (d,) order of the variables.
-        joint_names: (J,) order of the joints.
+        dof_names: (d,) names of the degrees of freedom, in order.
+        joint_names: (J,) names of the joints, in order.
         joint_positions: (K, J, 3) joint positions at the means, m, in the frame of the header.
         kind: see `MixtureKind`.
         stamp_ns: stamp of the image.
         frame_id: optical frame of the camera.
-        segment_lengths: segment lengths by name, m, which replace those of the body model. Empty
-            if unknown, as in messages of other publishers; the lengths are then from the Body
+        segment_lengths: segment lengths by name, m, which replace the lengths in the body model.
+            Empty if unknown, as in messages of other publishers; the lengths are then from the Body
             topic, or else from the body model.
         log_likelihoods: (K,) log p(image | mean) up to a constant; NaN or None if unknown.
         degrees_of_freedom: (K,) degrees of freedom of Student components; 0 for a Gaussian
@@ -94,7 +94,7 @@ class PoseMixture:
         state: state of the track, see `TrackState`.
         track_id: number of the track, from 1; 0 if the mixture belongs to no track.
         identities: (K,) identities of the components, from 1, constant over the images of a track;
-            0 for no identity, None if no component has one.
+            0 for no identity, None if all are 0.
         joint_covariances: (K, J, 3, 3) covariances of the joint positions, m^2; None if unknown.
         joint_covariances_relative: (K, J, 3, 3) covariances of the joint positions relative to the
             first joint, m^2; None if unknown.
@@ -105,8 +105,8 @@ class PoseMixture:
         cue_probabilities: probability that each image cue shows the person, by the name of the cue;
             'track' is the probability that some component is near the person. Empty if unknown;
             only posteriors of the filter have them.
-        error_share: fraction of the evidence of one image that is independent, in (0, 1], for a
-            likelihood; NaN if unknown.
+        error_share: for a likelihood, the fraction of the evidence of one image that is independent
+            of other images, in (0, 1]; NaN if unknown.
         error_time: correlation time of the errors of images, s; NaN if unknown.
         shape_covariance: (d, d) covariance of the pose errors that are common to all images because
             the person's lengths and flesh are uncertain, for a likelihood; None if unknown.
@@ -246,11 +246,11 @@ class PoseMixture:
     ) -> PoseMixture:
         """A mixture over the poses of a body with its current segment lengths.
 
-        Covariances and velocities of the joints are linearised functions of those of the poses,
+        Covariances and velocities of the joints follow from those of the poses by linearisation:
 
             S_joint = J S J',    v_joint = J v,    J = d joint / d pose at the mean
 
-        and the relative covariances use J - J_pelvis in place of J; the pelvis is the first joint.
+        The relative covariances use J - J_pelvis in place of J; the pelvis is the first joint.
 
         For the other arguments see the attributes.
 
@@ -403,7 +403,7 @@ def pose_mixture_of(
         dof_names, joint_names: required names in this order; None accepts any names.
 
     Raises:
-        MessageError: other names, contradictory lengths of arrays, weights that are not
+        MessageError: unexpected names, inconsistent lengths of arrays, weights that are not
             probabilities, or covariances that are not positive definite.
     """
     names = names_of(message.dof_names, 'mixture: dof_names')
@@ -464,7 +464,7 @@ def pose_mixture_of(
 
 
 def _existence(message: Any, state: TrackState) -> float:
-    """Existence probability; NaN if it is 0 because the publisher has not set it."""
+    """Existence probability; NaN if the publisher has left the field at 0."""
     value = float(message.existence_probability)
     return math.nan if state is TrackState.UNKNOWN and value == 0.0 else value
 
@@ -477,7 +477,7 @@ def _errors(message: Any) -> dict[str, Any]:
 
 
 def _chain(message: Any) -> dict[str, Any]:
-    """Posterior weights and ancestry by argument; None if the publisher has not set them."""
+    """Posterior weights and ancestry as arguments of `PoseMixture`; None if not set."""
     weights = np.array([c.posterior_weight for c in message.components])
     told, ids = np.nan_to_num(weights).any(), message.ancestry_ids
     rows = array_of_each(message.components, 'ancestry', (len(ids),), 'mixture')
@@ -490,6 +490,6 @@ def _chain(message: Any) -> dict[str, Any]:
 
 
 def _shape_covariance(message: Any, d: int) -> Array | None:
-    """The shape covariance (d, d); None if it is empty."""
+    """The shape covariance (d, d); None if the field is empty."""
     values = message.shape_covariance
     return numbers(values, (d, d), 'mixture: shape_covariance') if len(values) else None

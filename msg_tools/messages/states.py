@@ -99,7 +99,7 @@ def transforms_message(
         translations: (N, 3) t, m.
 
     Raises:
-        MessageError: contradictory lengths of arrays, or values that are not finite.
+        MessageError: inconsistent lengths of arrays, or values that are not finite.
     """
     r = np.asarray(rotations, dtype=np.float64)
     t = np.asarray(translations, dtype=np.float64)

@@ -45,13 +45,13 @@ class TrajectoryMixture:
         final_until_ns: time up to which poses are final.
         free_energy: (I,) free energy per iteration, nats.
         body_model: name of the body.
-        dof_names: (d,) order of the variables.
+        dof_names: (d,) names of the degrees of freedom, in order.
         frame_id: optical frame of the camera.
         segment_lengths: segment lengths by name, m, see `PoseMixture`; empty if unknown.
-        joint_names: (J,) order of the joints.
+        joint_names: (J,) names of the joints, in order.
         joint_positions: (M, T, J, 3) joint positions at the means, m; None if not computed.
         identities: (M,) identities of the motions, constant within a track, from 1; 0 for no
-            identity, None if no component has one.
+            identity, None if all are 0.
 
     Raises:
         MessageError: invalid shapes or values.
@@ -141,7 +141,7 @@ def trajectory_mixture_of(
         dof_names: required names in this order; None accepts any names.
 
     Raises:
-        MessageError: other names, contradictory lengths of arrays, weights that are not
+        MessageError: unexpected names, inconsistent lengths of arrays, weights that are not
             probabilities, covariances that are not positive definite, or stamps that do not
             increase.
     """

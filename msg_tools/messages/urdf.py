@@ -1,14 +1,14 @@
 """A body as a URDF, so that any ROS viewer can show it and move it by joint states.
 
-URDF has only joints of one degree of freedom, so a segment with several becomes a chain of links;
-the last link has the name of the segment. The joints have the names of the degrees of freedom. The
-transform from a segment to its parent is
+Joints in a URDF have one degree of freedom, so a segment with several degrees of freedom becomes a
+chain of links; the last link has the name of the segment. The joints have the names of the degrees
+of freedom. The transform from a segment to its parent is
 
     Trans(offset + translations) * mount * Rot(axis_1, q_1) * ... * Rot(axis_n, q_n)
 
 as in `hmt_ros.body.skeleton`. Links have no inertia, because the URDF is only for viewers.
-`link_frames` gives the frames of all links, also those within a chain: viewers warn about links
-without a frame.
+`link_frames` gives the frames of all links, including links within a chain, because viewers warn
+about links without a frame.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def link_frames(
 
     Args:
         pose: (d,) pose of the body.
-        index: index of the pose in the frames.
+        index: index of the pose in `frames`.
 
     Returns:
         Names of the links (L), as in `body_urdf` without a prefix; rotations (L, 3, 3) and origins
@@ -126,7 +126,7 @@ def link_frames(
     q = np.asarray(pose, dtype=np.float64)
     turned = frames.rotations()[index]
     origins = np.ascontiguousarray(frames.origins[:, :, index])
-    # The inverse of each rotation is a rotation by -q about its own axis, which stays fixed.
+    # The inverse of each rotation is a rotation by -q about the same axis.
     back = rotations_of(-q[:, None] * frames.axes[:, :, index])
     names: list[str] = []
     rotations: list[Array] = []
@@ -166,7 +166,7 @@ def add_limit(joint: ET.Element, lower: float, upper: float) -> None:
 
 
 def add_rod(link: ET.Element, end: Array, radius: float) -> None:
-    """Adds a rod to a link, from its origin to an end (3,), m; no rod if both are equal."""
+    """Adds a rod from the origin of a link to an end (3,), m, unless both are equal."""
     length = float(np.linalg.norm(end, axis=0))
     if length < 1e-6:
         return

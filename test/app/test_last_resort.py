@@ -174,10 +174,10 @@ def test_warnings_and_ends_of_threads_are_lines(run_with, capsys):
 WORK = """\
 import os, sys
 from hmt_ros.app.command_line import CommandParser, run_command
-from hmt_ros.app.progress import say, tell_user
+from hmt_ros.app.progress import say, notify_user
 def work(arguments):
     os.write(2, b'libpng error: CRC\\n')
-    tell_user('work', 'told')
+    notify_user('work', 'told')
     say('done \\udcff')
     return 0
 sys.exit(run_command(CommandParser('work'), work))

@@ -180,7 +180,7 @@ def test_several_people(walk_video, begun, tmp_path, monkeypatch):
 
 
 def test_metadata_tell_the_lens(walk_video, begun, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(track_video, 'told_fov', lambda path: 69.4)
+    monkeypatch.setattr(track_video, 'metadata_fov', lambda path: 69.4)
     out = ['-o', str(tmp_path / 'out'), '--no-detector']
     assert track_video.main([str(walk_video / 'walk.mp4'), '--quiet', *out]) == 0
     assert begun.imports[0].fov == 69.4

@@ -131,7 +131,7 @@ def test_a_person_is_subscribed_to_once(without_hri, world_of, monkeypatch):
     from hmt_msgs.msg import PoseMixture as PoseMixtureMessage
     from sensor_msgs.msg import CameraInfo
 
-    monkeypatch.setattr(without_hri, '_MOST_TOPICS', 3)
+    monkeypatch.setattr(without_hri, '_MAX_TOPICS', 3)
     inputs = {'camera_info': CameraInfo}
     one = world_of(without_hri.HriNode, 'hri_node', inputs, publish_cropped=False).start()
     first = one.other.create_publisher(PoseMixtureMessage, TOPIC, 100)

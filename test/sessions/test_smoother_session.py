@@ -25,7 +25,7 @@ WINDOW = ['trajectory_mixture', 'trajectory_markers']
 FINAL = ['smoothed_pose_mixture', 'smoothed_joint_states']
 
 # Constants of the session that tests change.
-CONSTANTS = ('longest_interval',)
+CONSTANTS = ('max_interval',)
 
 
 @pytest.fixture(scope='module')
@@ -136,7 +136,7 @@ def test_errors_that_last_are_discounted_once(session, outputs, likelihoods):
 
 def test_likelihoods_without_an_error_model_are_refused(session, outputs, likelihoods):
     """Likelihoods of earlier versions are already discounted; later messages are smoothed."""
-    one = session(longest_interval=1.0)
+    one = session(max_interval=1.0)
     handled = [
         one.take(MIXTURE, likelihoods.message(index, errors=UNKNOWN if index < 2 else INDEPENDENT))
         for index in range(5)
@@ -380,7 +380,7 @@ def test_a_new_body_begins_a_new_window(session, outputs, likelihoods):
 
 
 def test_nobody_in_view_ends_the_window(session, outputs, likelihoods):
-    one = session(longest_interval=0.5)
+    one = session(max_interval=0.5)
     for index in range(3):
         one.take(MIXTURE, likelihoods.message(index))
     del outputs[:]
@@ -474,7 +474,7 @@ BAD = {
 @pytest.mark.parametrize('name', BAD)
 def test_bad_mixtures_are_skipped(session, outputs, likelihoods, name):
     spoil, text = BAD[name]
-    one = session(longest_interval=1.0)
+    one = session(max_interval=1.0)
     handled = []
     for index in range(4):
         message = likelihoods.message(index)
@@ -513,7 +513,7 @@ def test_time_that_jumps_back_begins_a_new_window(session, outputs, likelihoods)
 
 
 def test_gaps_are_bridged_and_told(session, outputs, likelihoods):
-    one = session(longest_interval=0.15)
+    one = session(max_interval=0.15)
     handled = [one.take(MIXTURE, likelihoods.message(index)) for index in (0, 1, 6, 7, 14)]
     assert [len(h.faults) for h in handled] == [0] * 5
     assert [len(h.warnings) for h in handled] == [0, 0, 1, 0, 0]
@@ -653,7 +653,7 @@ def test_messages_from_elsewhere_tell_no_chain(session, outputs, likelihoods):
 
 def test_a_likelihood_that_is_lost_on_the_way(session, outputs, likelihoods):
     """Ancestry refers to a missing image, so modes continue those within reach."""
-    one = session(longest_interval=0.5)
+    one = session(max_interval=0.5)
     for index in (0, 1, 2, 4, 5, 6):
         handled = one.take(MIXTURE, likelihoods.message(index))
         assert handled.faults == handled.warnings == ()

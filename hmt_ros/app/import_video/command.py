@@ -104,7 +104,7 @@ class Imported:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; returns 0 when done, 1 for bad input (one line on stderr explains it)."""
+    """Runs the command; returns 0 on success, 1 for bad input (explained in one line on stderr)."""
     return run_command(_parser(), _import, argv, whole_or_nothing=True)
 
 
@@ -407,7 +407,7 @@ def _in_pixels_of(frame: Frame, mask: Mask) -> Mask:
 def _same_size(
     source: FrameSource, selection: Selection, mirror: bool
 ) -> Generator[Frame, None, None]:
-    """Yields the frames, mirrored on request; all must have the size of the first frame."""
+    """Yields the frames, mirrored on request; raises ValueError if their sizes differ."""
     size: tuple[int, ...] | None = None
     for frame in source.frames(selection):
         if size is not None and frame.image.shape != size:
@@ -491,7 +491,7 @@ def _check_ends(
 ) -> None:
     """Checks that the numbers of frames, keypoints and masks agree, if all frames were read.
 
-    Keypoints and masks of frames that are missing from a truncated file are no error.
+    Keypoints and masks are accepted for frames that are missing because the video is truncated.
     """
     if not source.ended:
         return

@@ -34,7 +34,7 @@ _MASK_THRESHOLD = 127  # threshold of masks, grey levels
 _MAX_SIDE_RATIO, _MIN_SIDE_RATIO = (
     0.99,
     0.1,
-)  # limits of the aspect ratio of a pixel, shorter over longer side
+)  # limits of the ratio of a pixel's shorter side to its longer side
 # OpenCV 4.6, which Ubuntu 24.04 ships, reports the rotation of a video with the wrong sign.
 _HAS_REVERSED_ROTATION = cv2.__version__.startswith('4.6.')
 
@@ -66,7 +66,7 @@ class Selection:
 
     Attributes:
         start, end: times since the first frame of the source, s; the end is not included.
-        every: step between selected frames, counted from the first at or after `start`.
+        every: step from one selected frame to the next; the first is at or after `start`.
     """
 
     start: float = 0.0
@@ -78,7 +78,7 @@ class Selection:
             raise ValueError(f'--start {self.start:g} is not before --end {self.end:g}')
 
     def wanted(self, times_ns: Iterator[int]) -> Iterator[tuple[int, int, bool]]:
-        """Yields number and time of each frame before the end, and whether it is wanted."""
+        """Yields number and time of each frame before `end`, and whether the frame is selected."""
         first = None
         for number, time_ns in enumerate(times_ns):
             if time_ns >= self.end * SECOND_NS:
@@ -93,11 +93,11 @@ class FrameSource:
 
     Args:
         names: names of the image files in order; empty for a video file.
-        first_number: number that labels give to the first frame.
+        first_number: number of the first frame in labels.
 
     Attributes:
         claimed: number of frames according to the header; 0 if unknown.
-        count: number of frames read so far, wanted or not.
+        count: number of frames read so far, selected or not.
         ended: whether the last frame was read.
         notes: lines of text for the user about mirrored frames and pixel shapes.
         rate: frames per second; None if unknown.
@@ -311,8 +311,8 @@ def natural_order(name: str) -> list[tuple[int, str]]:
 class Masks:
     """Masks that belong to the frames of a source.
 
-    In a folder the file name of a mask gives its frame (`FrameSource.number_of`); in a video a mask
-    belongs to the frame of the same number.
+    In a folder of masks, the file name identifies the frame (`FrameSource.number_of`); in a video
+    of masks, the frame number is the same.
 
     Raises:
         ValueError: no masks, a file name without a frame, or two masks of one frame.

@@ -1,7 +1,7 @@
 """Reads the focal length from the metadata of a video file, where Apple phones write it.
 
-The key is in the metadata of the movie or of its track (QuickTime File Format, Metadata): a box
-`keys` with names, and a box `ilst` with a value for the number of each name.
+The key is in the metadata of the movie or of its track (QuickTime File Format, Metadata): the box
+`keys` lists names, and the box `ilst` has a value for the index of each name.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def _focal_lengths(data: Data) -> Iterator[float]:
 
 
 def _number(value: bytes) -> float:
-    """The number in a value, which consists of type, language and number."""
+    """The number in a metadata value, which consists of type, language and number."""
     kind, content = int.from_bytes(value[:4], 'big'), value[8:24]
     if kind in _FLOAT_TYPES:
         return float(struct.unpack(_FLOAT_TYPES[kind], content)[0])

@@ -1,4 +1,4 @@
-"""The input of the filter in a bag: images, calibration, additional inputs, transforms."""
+"""Finds the filter's input in a bag: images, calibration, additional inputs, transforms."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _USUAL_TOPICS = ('image/compressed', 'image')
 GROUND_TRUTH = 'ground_truth'
 # Inputs read from the bag; replay recomputes predictions.
 RECORDED_INPUTS = (*(row for row in INPUTS if row is not PREDICTION_INPUT), DETECTIONS_INPUT)
-# Fixed frames with z up [REP 105], and maximum number of messages searched for such a frame.
+# Fixed frames with z up [REP 105], and maximum number of messages searched for these frames.
 UPRIGHT_FRAMES = ('odom', 'map', 'world')
 _MAX_SEARCHED_MESSAGES = 2000
 # Suffix of the topic with the filter's overlay images.
@@ -49,8 +49,7 @@ class RecordedInput:
         given: topics of the additional inputs, by source.
         transforms: topics of the transforms in the bag, by source in `TRANSFORMS`; None if
             transforms are not used.
-        upright_frame: ancestor of the camera frame that is one of `UPRIGHT_FRAMES`; empty if
-            missing.
+        upright_frame: ancestor of the camera frame among `UPRIGHT_FRAMES`; empty if missing.
         video: whether the images are packets of a video, which `messages` decodes.
         scaled: image size (width, height), px, to which `messages` scales the calibration; None
             if the calibration needs no scaling.
@@ -82,7 +81,7 @@ class RecordedInput:
         """Yields (source, message) by log time; a source is a filter input or `GROUND_TRUTH`.
 
         Raises:
-            BagError: the bag is damaged; raised after the messages before the damage.
+            BagError: the bag is damaged; raised after the intact messages.
         """
         sources = {self.image.name: IMAGE, self.camera_info.name: CAMERA_INFO}
         if self.ground_truth is not None:
@@ -114,7 +113,7 @@ class RecordedInput:
 
 
 def _scaled(stored: BagMessage, size: tuple[int, int]) -> BagMessage:
-    """Scales a camera_info message to images of another size."""
+    """Scales the calibration in a camera_info message to a different image size."""
     try:
         camera, header = camera_from_info(stored.message, size), stored.message.header
     except ValueError:
@@ -291,13 +290,13 @@ def _camera_info_topic(bag: BagReader, image: Topic, name: str | None) -> Topic:
 def _in_namespace(
     bag: BagReader, namespace: str, name: str, kinds: tuple[str, ...]
 ) -> Topic | None:
-    """The topic with a name and one of the types, in the namespace or else in the root."""
+    """The topic with a given name and type, in the namespace or else in the root."""
     inside = absolute_name(name, namespace).lstrip('/')
     return _named(bag, inside, kinds) or _named(bag, name, kinds)
 
 
 def _named(bag: BagReader, name: str, kinds: tuple[str, ...]) -> Topic | None:
-    """The topic with a name and one of the types."""
+    """The topic with a given name and one of the given types."""
     found = (topic for topic in bag.topics_of(*kinds) if topic.name.lstrip('/') == name)
     return next(found, None)
 

@@ -123,7 +123,7 @@ class LiveNode:
         sensors: topics with sensor data QoS, which may lose messages; the QoS is overridden to
             reliable.
         module: module that runs the node; empty selects `hmt_ros.nodes.<name>`.
-        within: shared process of several nodes, which the caller starts; None starts a new process.
+        within: process that several nodes share and the caller starts; None starts a new process.
         write: called with topic, stamp and bytes of each message of the node, in order.
 
     Raises:
@@ -172,7 +172,7 @@ class LiveNode:
         return bool(self._answers)
 
     def answer(self, source: str, seconds: float | None = None) -> Handled:
-        """Waits until the next message is handled, and writes the results of the node.
+        """Waits until the node has handled its next message, and writes the results.
 
         Args:
             seconds: maximum time to wait; None selects `MESSAGE_SECONDS`.
@@ -250,7 +250,7 @@ class LiveNode:
             future = self._state.call_async(self._state_request)
             self._wait(future.done, START_SECONDS, 'the state of the node')
             label = future.result().current_state.label
-        # Shared topics have one more subscriber, the player.
+        # The player is an additional subscriber of shared topics.
         publishers = self._publishers.items()
         self._wait(
             lambda: all(
@@ -295,10 +295,10 @@ class LiveNode:
         return self._process.stop()
 
     def stop_well(self) -> None:
-        """Ends the node, and checks its exit code.
+        """Ends the node, and checks that its exit code is 0.
 
         Raises:
-            LiveNodeError: its exit code is not 0.
+            LiveNodeError: the exit code of the node is not 0.
         """
         code = self.stop()
         if code != 0:
@@ -325,7 +325,7 @@ class LiveNode:
         return options
 
     def _topic(self, name: str) -> str:
-        """Absolute topic name; absolute topics that the node publishes get its name as prefix."""
+        """Absolute topic name; absolute topics of the node get the node's name as prefix."""
         if not name.startswith('/'):
             return f'/{name}'
         return f'/{self.name}{name}' if name in self._topics else name
@@ -342,7 +342,7 @@ class LiveNode:
             )
             for source, (topic, msgtype) in inputs.items()
         }
-        # Sources on topics that the node also publishes, and the player's own messages on them.
+        # Sources on topics that the node also publishes, and the player's messages on these topics.
         self._shared = {source for source, (topic, _) in inputs.items() if topic in self._topics}
         self._own = OwnMessages()
         shared = {inputs[source][0] for source in self._shared}
@@ -361,7 +361,7 @@ class LiveNode:
             player.reliable,
             raw=True,
         )
-        # Created last, so that discovery announces the topics above before this client.
+        # Created last, so that the topics above are discovered before this client.
         self._state = node.create_client(GetState, f'/{self.name}/get_state')
         self._state_request = GetState.Request()
 
@@ -391,7 +391,7 @@ class LiveNode:
 
 
 def _into(queue: deque[bytes], own: OwnMessages | None = None) -> Callable[[bytes], None]:
-    """Returns a callback that queues messages except own ones; rclpy needs its signature."""
+    """Returns a callback that queues messages except the player's; rclpy inspects its signature."""
 
     def receive(data: bytes) -> None:
         if own is None or not own.is_own(data):

@@ -1,7 +1,7 @@
 """Replay of many bags, one after the other or through Dask; complete bags are skipped.
 
-Each new bag `<name>` has `<name>.replay.json` beside it, which records its inputs (sizes and times
-of the input files, all parameters, checksums of the files that they name, the version of this
+Each new bag `<name>` has `<name>.replay.json` next to it, which records the inputs (sizes and times
+of the input files, all parameters, checksums of the files that parameters name, the version of this
 package) and whether the new bag is complete. The record is written before and after the replay.
 """
 
@@ -34,7 +34,7 @@ from msg_tools.files.error_line import MAX_LINE, error_line, one_line
 from msg_tools.files.new_folder import locked, new_file
 from msg_tools.files.plain_json import read_plain_json
 
-# Options other than parameters that affect the new bag.
+# Options, other than parameters, that affect the new bag.
 _DECISIVE_OPTIONS = (
     'image_topic',
     'camera_info_topic',
@@ -179,7 +179,7 @@ def _by_dask(jobs: Sequence[Job], scheduler: str) -> Iterator[Outcome]:
 
 
 def _replay_in_worker(job: Job) -> Outcome:
-    """Runs `replay_job` on one core; the other cores have their own workers."""
+    """Runs `replay_job` on one core, because each core has a worker."""
     limit_threads(1)
     cv2.setNumThreads(1)
     _keep_memory()
@@ -192,7 +192,7 @@ def _keep_memory() -> None:
     In Dask workers the library would return freed memory at once; the workers would then spend more
     than a quarter of their time on new pages, which the system fills with zeros.
     """
-    mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)  # only glibc has it
+    mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)  # only glibc has this function
     if mallopt is not None:
         for parameter, value in (_TRIM_THRESHOLD, _MMAP_THRESHOLD):
             mallopt(parameter, value)
@@ -325,7 +325,7 @@ def _jobs(
 
 
 def _bags_in(folder: Path, output: Path | None) -> Iterator[tuple[str, Path]]:
-    """Names and paths of the bags in a folder, at any depth, except those in the output."""
+    """Names and paths of the bags in a folder, at any depth, except bags in the output folder."""
     avoided = None if output is None else output.resolve()
     for here, folders, files in os.walk(folder):
         place = Path(here)

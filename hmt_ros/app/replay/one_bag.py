@@ -136,7 +136,7 @@ def _subject_hint(bag: Path) -> str:
 
 
 def _used(recorded: RecordedInput, parameters: NodeParameters) -> RecordedInput:
-    """The recorded input with only the topics that some node uses."""
+    """The recorded input, reduced to the topics that at least one node uses."""
     tracking, bme = parameters.filter, parameters.bme
     rows = session_of(tracking).inputs_of(tracking)
     used = [row for row in rows if row.is_used(tracking)]
@@ -202,7 +202,7 @@ def _play(
 
 
 def _read(messages: Iterator[tuple[str, BagMessage]], decode: bool) -> tuple[str, BagMessage, Any]:
-    """Returns the source of the next message, the stored message, and the form for the nodes.
+    """Returns the source of the next message, the stored message, and the message for the nodes.
 
     With `decode`, compressed images are decoded for the nodes.
 
@@ -294,9 +294,9 @@ class ReadAhead(AbstractContextManager['ReadAhead[Item]'], Generic[Item]):
 class WriteBehind(AbstractContextManager['WriteBehind']):
     """Runs queued calls in order in a thread, while the caller continues.
 
-    The end of the context waits for all calls, or drops them after an error. It raises the error of
-    a failed call, as `check` does; later calls are skipped. `call` itself does not raise it, so
-    that the caller does not mistake it for its own error.
+    Leaving the context waits for all queued calls, or drops them after an error. Calls after a
+    failed call are skipped. The error of the failed call is raised by `check` and on leaving the
+    context, but not by `call`, whose caller could mistake it for its own error.
     """
 
     def __init__(self) -> None:
@@ -318,7 +318,7 @@ class WriteBehind(AbstractContextManager['WriteBehind']):
         self._waiting.append(self._thread.submit(self._make, function, arguments))
 
     def check(self) -> None:
-        """Raises the error of a call, if one has failed."""
+        """Raises the error of a queued call that has failed, if any."""
         if self._error is not None:
             raise self._error
 

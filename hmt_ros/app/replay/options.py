@@ -105,7 +105,7 @@ class ReplayOptions:
         return replace(self._renamed(absolute), config=config)
 
     def _renamed(self, rename: Callable[[str], str]) -> ReplayOptions:
-        """The options with `rename` applied to all file names except those of --config."""
+        """The options with `rename` applied to all file names except the files of --config."""
 
         def path(value: Path | None) -> Path | None:
             return None if value is None else Path(rename(str(value)))
@@ -249,10 +249,11 @@ def _bme_parameters(
 
 
 def _given_values(options: ReplayOptions, node: str) -> dict[str, Any]:
-    """Values from --config and --set for a node, by name."""
+    """Parameter values for a node from --config and --set, by parameter name."""
     values: dict[str, Any] = {}
     for file in options.config:
-        # Sections for all nodes apply only to the tracking node; others use names differently.
+        # Only the tracking node reads sections for all nodes, because other nodes use some names
+        # differently.
         read = read_parameter_file(file, node, by_name=node not in (FILTER, PEOPLE_NODE))
         values.update(
             (name, value)

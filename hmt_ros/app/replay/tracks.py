@@ -3,7 +3,8 @@
 The BME gets each image before the filter, which also gets the `pose_prediction` of the BME. The
 smoother gets the `likelihood_mixture` of the filter; the BME gets the filter's `pose_mixture` if it
 predicts less often while the person is tracked. Then the next message is processed. At the end of
-the bag they finish in the same order. No message announces the end, so real nodes are deactivated.
+the bag the nodes finish in the same order. No message announces the end; real nodes are deactivated
+instead.
 """
 
 from __future__ import annotations
@@ -244,7 +245,7 @@ def _is_recorded(topic: str) -> bool:
 
 
 def _together(one: Handled | None, other: Handled) -> Handled:
-    """Merges the results for a message and for another message that resulted from it."""
+    """Merges the results for a message and for a further message that it has caused."""
     if one is None:
         return other
     return Handled(

@@ -1,1 +1,1 @@
-"""The command `report`: figures and one HTML page of the content of a bag."""
+"""The command `report`, which shows the content of a bag as figures and one HTML page."""

@@ -23,8 +23,8 @@ from msg_tools import BagReader
 from msg_tools.files.new_folder import FolderKind
 
 PAGE = 'report.html'
-# Maximum size, bytes, of the page, of its data (further times are left out), and of its images: a
-# constant, and as much again per second.
+# Maximum sizes, bytes: the page; its data (times that do not fit are left out); its images, as a
+# constant and an equal addition per second.
 PAGE_BYTES = 19_500_000
 DATA_BYTES = 12_000_000
 IMAGE_BYTES = 700_000
@@ -72,7 +72,7 @@ class ReportOptions:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; returns 0 when done, 1 for bad input (one line on stderr explains it)."""
+    """Runs the command; returns 0 on success, 1 for bad input (explained in one line on stderr)."""
     return run_command(_parser(), _report, argv, whole_or_nothing=True)
 
 
@@ -201,7 +201,7 @@ def _content(options: ReportOptions, source: ImageSource | None, bar: Progress) 
 
 
 def _with_truth(mixtures: RecordedMixtures, truth: Truth) -> list[str]:
-    """Topics that can be scored; all topics if none can, so that scoring raises the error."""
+    """Topics that have ground truth, or else all topics, so that scoring raises the error."""
     stamps = {layer.topic: set(layer.mixtures) for layer in mixtures.layers}
     for layer in mixtures.trajectories:
         if layer.joint_names:  # without a body there are no joints

@@ -42,11 +42,11 @@ def read_detector(path: Path, layer: Layer[Moment]) -> Detector | None:
 
     Args:
         path: path of the bag.
-        layer: the mixtures to show; the topic of the detector is in the same namespace, or else
-            the only one of its type in the bag.
+        layer: the mixtures to show; the topic of the detector is in the same namespace, or else the
+            bag's only Keypoints3D topic.
 
     Returns:
-        The skeletons; None if the bag has none with a pelvis or hips at these times.
+        The skeletons; None if no skeleton at these times has a pelvis or hips.
 
     Raises:
         ValueError: an invalid message.
@@ -74,7 +74,7 @@ def read_detector(path: Path, layer: Layer[Moment]) -> Detector | None:
 
 
 def _at_joints(positions: Positions, names: tuple[str, ...]) -> dict[str, Array]:
-    """Position of each joint: the mean of its landmarks that vary least between people."""
+    """Position of each joint: the mean of the landmarks that vary least between people."""
     found: dict[str, dict[float, list[Array]]] = {}
     marks = landmarks_of(positions.names, names)
     for name, mark, place in zip(positions.names, marks, positions.positions, strict=True):

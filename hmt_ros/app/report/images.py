@@ -20,7 +20,7 @@ from msg_tools.messages.camera_info import camera_from_info
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import decode_image, encode_jpeg
 
-# Width in px and JPEG quality, from the best to the smallest.
+# Width, px, and JPEG quality of each level, from best to smallest.
 _QUALITIES = (
     (640, 80),
     (640, 65),
@@ -158,7 +158,7 @@ def film_strip(
 
 
 def _small(image: Image, allowed: int, level: int) -> tuple[bytes, int]:
-    """The best JPEG of an image within `allowed` bytes, or else the smallest, and its level."""
+    """Best JPEG of an image within `allowed` bytes, or else the smallest JPEG, and the level."""
     while True:
         width, quality = _QUALITIES[level]
         scaled = image

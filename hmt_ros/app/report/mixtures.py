@@ -62,7 +62,7 @@ def ground_at(grounds: Mapping[int, GroundState], stamp_ns: int) -> GroundState 
 
 
 def _plane_of(ground: GroundState | None) -> Array:
-    """The floor (4,), or else the plane of a level camera."""
+    """The floor (4,), or else a horizontal plane through a level camera."""
     plane = None if ground is None else ground.plane
     return _LEVEL_PLANE if plane is None else plane
 
@@ -241,7 +241,7 @@ class RecordedMixtures:
         return set(self.answered).difference(*(layer.mixtures for layer in self.layers), *windows)
 
     def at(self, stamps: Iterable[int]) -> RecordedMixtures:
-        """Copy with only the mixtures and windows at given stamps, or else the last window."""
+        """Copy with only the given stamps; topics without a window at any of them keep the last."""
         wanted = set(stamps)
         layers = [layer.at(wanted) for layer in self.layers]
         return RecordedMixtures(
@@ -267,7 +267,7 @@ def read_mixtures(
     Args:
         path: path of the bag.
         topics: names of the topics to read; empty selects all mixtures except ground truth.
-        body_model: name or file of the body model, if the name in the bag is unknown.
+        body_model: name or file of the body model, which replaces the name in the bag.
         grounds: ground by stamp, from which heights are computed.
         progress: called with the number of messages that were read.
 

@@ -357,7 +357,7 @@ def _detector(detector: Detector, content: Content, grid: _Grid) -> dict[str, An
 def _one_each(
     names: tuple[str, ...], joints: Mapping[int, Array], content: Content, grid: _Grid
 ) -> dict[str, Any]:
-    """Data of one skeleton over time; `known` marks the times at which it is known."""
+    """Data of one skeleton over time; `known` marks the times at which the skeleton is known."""
     known = [joints[stamp][None] for stamp in content.stamps if stamp in joints]
     positions = np.concatenate([np.zeros((0, len(names), 3)), *known])
     return {

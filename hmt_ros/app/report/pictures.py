@@ -126,7 +126,7 @@ def _draw_errors(axes: Any, track: Layer[Moment], truth: Truth, seconds: Array) 
 
 
 def _draw_calibration(path: Path, scores: dict[str, TrackScores]) -> None:
-    """Plots the coverage of the highest-density regions against their probability."""
+    """Plots the coverage of highest-density regions against their nominal probability."""
     with new_picture(path, (10.4, 4.8), 'constrained') as figure:
         axes: Any = figure.subplots(1, 3, sharey=True)
         for number, (name, topic) in enumerate(scores.items()):

@@ -53,7 +53,7 @@ STYLE: Any = {
     'axes.titlesize': 9.0,
     'savefig.facecolor': 'white',
 }
-# Maximum number of modes on an image, because more would hide it.
+# Maximum number of modes on an image, because more modes would hide the image.
 MAX_MODES_ON_IMAGE = 3
 MIN_OPACITY = 0.12
 _DASH_PATTERN: Any = (0, (2, 1.2))

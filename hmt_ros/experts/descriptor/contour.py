@@ -2,13 +2,13 @@
 
 A mask may show more than the person: other people, ghosts, or pieces separated by background
 subtraction. One blob is taken as the person, together with the pieces that belong to it; other
-blobs are counted so that callers can report them. The result also says at which sides the border of
-the image cuts the person.
+blobs are counted so that callers can report them. The result also indicates the sides at which the
+border of the image cuts the person.
 
-`centred_view` is the silhouette in a camera without distortion that looks straight at the person.
-Near the border of an image, especially with a wide-angle lens, a person appears stretched and
-leaning. Seen along the optical axis, a posture looks the same at all places in the image, and its
-target (`hmt_ros.experts.pose_encoding`) is the same, too.
+`centred_view` renders the silhouette in a view without distortion, centred on the person. Near the
+border of an image, especially with a wide-angle lens, a person appears stretched and leaning. In
+the centred view, a posture looks the same at all places in the image, and its target
+(`hmt_ros.experts.pose_encoding`) is the same, too.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class PersonBlob:
 
 
 def person_blob(mask: ArrayLike) -> PersonBlob:
-    """The largest blob of a mask that looks like a person, with the pieces that belong to it.
+    """Find the largest blob that looks like a person in a mask, with the pieces that belong to it.
 
     Args:
         mask: (H, W) nonzero in the foreground.
@@ -158,7 +158,7 @@ def sample_contour(mask: Bytes, count: int = 100) -> tuple[Array, Array]:
         points (count, 2), px, and directions (count,), rad.
 
     Raises:
-        NoSilhouetteError: there is no outline of notable length.
+        NoSilhouetteError: no outline is long enough.
     """
     bordered = cv2.copyMakeBorder(mask, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
     found, tree = cv2.findContours(bordered, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
@@ -206,16 +206,18 @@ def _smooth(outline: Array) -> Array:
 def centred_view(
     blob: PersonBlob, camera: Camera, level: Array = UPRIGHT_FRAME, grey: Bytes | None = None
 ) -> tuple[Bytes, Bytes | None]:
-    """Mask (h, w) of the person, 1 inside, in the camera turned to the middle of the box.
+    """Mask (h, w) of the person, 1 inside, seen by the camera turned to the middle of the box.
 
     Args:
         blob: the person.
         camera: camera of the mask.
-        level: (3, 3) rotation about the optical axis from an upright camera's axes to its own.
+        level: (3, 3) rotation about the optical axis, from an upright camera's axes to the axes of
+            `camera`.
         grey: (H, W) grey levels of the camera's image, or None.
 
     Returns:
-        The person, and the grey levels (h, w) in this view, or None.
+        The mask of the person and the grey levels (h, w), both in the new view; None without
+        `grey`.
     """
     if grey is not None:
         height, width = blob.mask.shape
@@ -227,7 +229,7 @@ def centred_view(
     if upright and not camera.distortion and axis[2] > elementary.cos(MAX_STRAIGHT_ANGLE):
         return blob.mask, grey
     corners = np.array([[x, y] for x in (left, middle[0], right) for y in (top, middle[1], bottom)])
-    # From the view to the camera.
+    # Rotation from the view to the camera.
     turn = product(level, ray_rotations(product(axis[None], level))[0])
     seen = product(camera.rays(corners), turn)
     reach = float(np.abs(seen[:, :2] / np.maximum(seen[:, 2:], 0.1)).max())

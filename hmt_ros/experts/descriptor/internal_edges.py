@@ -68,5 +68,5 @@ def internal_edges(grey: Bytes, mask: Bytes, centre: tuple[float, float], width:
         for which, part in ((first, 1.0 - share), (first + 1.0, share)):
             bins = cells + which.astype(np.intp) % ANGLES
             own += np.bincount(bins, size * part, own.size)
-    # Relative to the number of pixels in a quarter of a cell.
+    # Divide by the number of pixels in a quarter of a cell.
     return np.sqrt(result.ravel() * (4.0 * CELLS * CELLS) / (width * width))

@@ -1,27 +1,27 @@
 """The descriptor of a silhouette: the vector from which a pose is predicted (BME 3).
 
-It has five descriptions of the person, who is first resized to a standard size:
+It combines five descriptions of the silhouette, which is first resized to a standard size:
 
 - the histogram of shape contexts over a codebook: which local shapes occur;
 - the histogram of edge pairs across the inside: how thick and how bent limbs are;
 - a map of the signed distance to the outline: where limbs are;
 - moments and proportions of the whole;
-- edges inside, if there is an image (`internal_edges`). Without an image the descriptor uses their
-  mean.
+- edges inside, if there is an image (`internal_edges`). Without an image the descriptor uses the
+  mean of these features.
 
 All are invariant to the position and the size of the person in the image. Edge pairs are also
-invariant to rotation; the others are not, because cameras are usually upright. A silhouette and its
-mirror image have different descriptors. The parts are weighted and projected on the principal
-components of the training silhouettes.
+invariant to rotation; the other descriptions are not, because cameras are usually upright. A
+silhouette and its mirror image have different descriptors. The parts are weighted and projected
+onto the principal components of the training silhouettes.
 
-The shape context of a point is the histogram of the positions of the other points relative to it:
-5 radial bins on a log scale from 1/8 to 3 of the mean distance, and 12 angular bins. K-means over
-all contexts of a training set gives a codebook. A silhouette is the sum of the votes of its
-contexts for their nearest centres, weighted by inverse distance.
+The shape context of a point is the histogram of the positions of the other points relative to it: 5
+radial bins on a log scale from 1/8 to 3 of the mean distance, and 12 angular bins. K-means over all
+contexts of a training set gives a codebook. A silhouette is described by a histogram: each of its
+contexts votes for the nearest centres, weighted by inverse distance.
 
-An edge pair is two points whose connection lies inside the silhouette: the two sides of a limb or
-of the trunk, or the two ends of a straight part. The histogram of the distances and angles of edge
-pairs shows how thick and how bent limbs are, wherever they are.
+Two points form an edge pair if the line between them lies inside the silhouette: points on the two
+sides of a limb or of the trunk, or at the two ends of a straight part. The histogram of the
+distances and angles of edge pairs shows how thick and how bent limbs are, wherever they are.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class ShapeContextCodebook:
     dominate.
 
     Raises:
-        ValueError: the centres have another shape or are not finite.
+        ValueError: the centres have a wrong shape or are not finite.
     """
 
     centres: Array
@@ -160,7 +160,7 @@ MOMENTS = 12
 FIXED_FEATURES = (
     PAIR_BINS + MAP_SIDE * MAP_SIDE + MOMENTS + EDGES
 )  # number of features other than shape contexts
-MIN_POINTS, MAX_POINTS = 8, 500  # on the outline; costs grow with the square
+MIN_POINTS, MAX_POINTS = 8, 500  # of the outline; the cost is quadratic in the points
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,8 +170,8 @@ class SilhouetteParts:
     Attributes:
         contexts: (n, 60) shape contexts of the points of the outline.
         edge_pairs: (48,) histogram.
-        distances: (MAP_SIDE * MAP_SIDE,) signed distances to the outline, positive inside, radii of
-            gyration.
+        distances: (MAP_SIDE * MAP_SIDE,) signed distances to the outline, positive inside, in radii
+            of gyration.
         moments: (12,) second and third moments, proportions.
         edges: (EDGES,) see `internal_edges`; NaN: unknown.
     """

@@ -1,17 +1,17 @@
-"""Depth: visible points of the model's surface lie where a depth image sees a surface.
+"""Depth: visible points of the model's surface lie on the surface measured by a depth image.
 
     E(x) = w / V sum_i rho((D(u_i(x)) - z_i(x)) / sigma_i)
     sigma_i^2 = sigma^2 + (growth D^2)^2 + (noise_i / cos a_i)^2
 
-over the V visible points i of the flesh: on every ring, one point on either side of the part that
+over the V visible points i of the flesh: on every ring, one point on either side of the place that
 faces the camera. D is the depth image, registered to the colour image, and z the depth of the
 point, both along the axis of the camera, m. The error of a triangulating sensor grows with the
 square of the distance [Khoshelham and Elberink, Sensors 2012]. The error of the flesh, `noise`, is
 along the normal of the surface, and a is the angle between the normal and the ray. For the
-gradient, points are fixed to the skin, and standard deviations are constant.
+gradient, points are fixed to the skin, and standard deviations are treated as constant.
 
-A point without a measurement has the cost of an error of one standard deviation, whatever the pose.
-A surface in front of a point, or far behind it, costs at most the maximum of the kernel.
+A point without a measurement has the cost of an error of one standard deviation, at every pose. A
+surface in front of a point, or far behind it, costs at most the maximum of the kernel.
 """
 
 from __future__ import annotations

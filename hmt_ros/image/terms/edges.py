@@ -47,7 +47,7 @@ class EdgeInputs(NamedTuple):
 
 
 def edge_distances(window: ImageWindow) -> ImageMap:
-    """Distance to the nearest edge, for each orientation bin of its normal, px."""
+    """Distance to the nearest edge, px, for each bin of the orientation of the edge's normal."""
     grey = cv2.cvtColor(window.image, cv2.COLOR_BGR2GRAY)
     grey = cv2.GaussianBlur(grey, (0, 0), 1.0)
     dx = cv2.Sobel(grey, cv2.CV_16S, 1, 0)

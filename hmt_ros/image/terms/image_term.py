@@ -1,8 +1,9 @@
-"""The parts of a term of the image likelihood.
+"""The parts of which a term of the image likelihood consists.
 
 Each term has one file in this folder, with its default settings, the extraction of its evidence
-from an image, and one `ImageTerm` that names them; `registry` lists the terms. Its energy is one
-header in `core/terms`; `core/terms.h` lists the headers. No other code depends on the terms.
+from an image, and one `ImageTerm` that refers to both; `registry` lists the terms. The energy of a
+term is one header in `core/terms`; `core/terms.h` lists the headers. No other code depends on the
+terms.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from numpy.typing import NDArray
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.inference.arrays import Array, Image
 
-# An absent mask, and an absent map.
+# Placeholders for a missing mask and a missing map.
 NO_MASK = np.zeros((0, 0), np.uint8)
 NO_MAP = ImageMap(np.zeros((2, 2, 2), np.float32))
-# Factors on the energies at segments if all are 1.
+# Factors on the energies at segments if all factors are 1.
 NO_FACTORS = np.zeros(0)
 
 
@@ -76,7 +77,7 @@ class ImageWindow:
 
     @property
     def widest(self) -> Image | None:
-        """Silhouette (h, w) with unsure pixels and other people, 0 or 1; None if unknown."""
+        """Union (h, w) of silhouette, unsure pixels and other people, 0 or 1; None if unknown."""
         widest = self.mask
         if widest is not None:
             for more in (self.unsure, self.others):
@@ -84,15 +85,15 @@ class ImageWindow:
         return widest
 
     def as_map(self, channels: NDArray[np.float32]) -> ImageMap:
-        """Values (C, h, w) of the window as a map of the whole image."""
+        """Wraps values (C, h, w) in the window as an `ImageMap` of the whole image."""
         return ImageMap(channels, self.left, self.top)
 
 
 class Weighting(NamedTuple):
-    """`TermSettings` as compiled code reads them; a weight of 0 switches the term off.
+    """`TermSettings` as input of the compiled core; a weight of 0 switches the term off.
 
     `magnification`, px/m at the person, converts errors of the body to pixels. `segments` contains
-    factors (S,) on the energies at each segment; (0,) if all are 1.
+    factors (S,) on the energies at each segment, or (0,) if all factors are 1.
     """
 
     weight: float
@@ -108,13 +109,14 @@ class ImageTerm:
     """One term of the image likelihood.
 
     Attributes:
-        name: name of the term, of its settings and of its evidence.
-        meaning: the compared quantities; descriptions of the term's parameters start with this.
+        name: name of the term; settings and evidence have the same name.
+        meaning: description of the compared quantities; the descriptions of the term's parameters
+            start with it.
         settings: default settings.
-        evidence: extracts the evidence of the term from an image; returns None if missing.
-        inputs: makes the inputs of the core, a NamedTuple that starts with the `Weighting` and is
-            read field by field into the struct of the term's header. Without evidence (None) the
-            weight is 0, and arrays are empty but of the same types.
+        evidence: function that extracts the term's evidence from an image; returns None if missing.
+        inputs: function that makes the inputs of the core: a NamedTuple that starts with the
+            `Weighting`; its fields fill the struct of the term's header. Without evidence (None)
+            the weight is 0, and arrays are empty but have the same types.
         needs_contour: whether the term needs the contour of the model.
     """
 

@@ -4,10 +4,10 @@
     E_k,e(x) = w sum_a rho([W_k (u_k,e(x) - p_k)]_a),         W_k' W_k = (S_k + (m s_k)^2 I)^-1
 
 u_k,e is the projection of the landmark of keypoint k, which was detected at p_k with covariance S_k
-(px^2) and noise s_k on the person (in metres; the magnification is m px/m). Detectors confuse left
+(px^2) and noise s_k (metres on the person); m is the magnification (px/m). Detectors confuse left
 and right: in the exchange e, of prior probability p_e, the keypoints of all limbs, of the arms or
-of the legs show the landmarks of the other side. For lifted poses, a mixture over joint depths is
-added (`Lifted`).
+of the legs show the landmarks of the other side. For lifted poses, the energy of a mixture over
+joint depths is added (`Lifted`).
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ USUAL_EXTENT = 1.4
 USUAL_STATURE = 1.7
 # Minimum standard deviation of a keypoint whose noise is learned, px.
 MIN_SIGMA = 1.5
-# Factor on the energy of a mixture over lifted poses, because errors of joints are correlated; and
-# scale of its kernel, in standard deviations, because limbs of lifted poses may be wrong. Both were
-# chosen together with the time constant of `ERRORS['lifted']`.
+# Factor on the energy of a mixture over lifted poses, because errors of joints are correlated, and
+# scale of the energy's kernel, in standard deviations, because limbs of lifted poses may be wrong.
+# Both were chosen together with the time constant of `ERRORS['lifted']`.
 LIFTED_WEIGHT, LIFTED_KERNEL = 0.1, 3.0
 # Groups of landmarks that change sides together, and the groups (E, G) that change sides in each
 # exchange: none, all, arms, legs.
@@ -63,7 +63,7 @@ NOT_EXCHANGED = np.array([[0.0, -np.inf, -np.inf, -np.inf]])
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Image positions of joints, from any 2D detector or by hand.
+    """Image positions of joints, from any 2D detector or marked by hand.
 
     Attributes:
         names: (n,) joints of the body; before `named_for`, landmarks of the detector.
@@ -74,9 +74,9 @@ class Keypoints:
             where unknown. None if the detector gives no 3D positions.
         landmarks: (n,) canonical names of landmarks (`keypoint_schemes`), '' for joints; None:
             all keypoints are joints.
-        scheme: keypoint scheme of the detector, once it is known.
-        lifted: mixture over whole poses from keypoints or positions; only its depths count, because
-            across the line of sight the keypoints themselves are the evidence.
+        scheme: keypoint scheme of the detector; None if unknown.
+        lifted: mixture over whole poses from keypoints or positions; only its depths are used,
+            because the keypoints themselves are the evidence across the line of sight.
         offsets: (n, 3) from each joint to its landmark in the frame of the joint's segment, m;
             None: the keypoints are joints.
         noise: (n,) standard deviations in addition to the covariances, m on the person; they
@@ -111,7 +111,7 @@ class Keypoints:
 
     @property
     def trunk(self) -> Array:
-        """Vector (2,) from mid-hips to mid-shoulders, px; NaN unless all four are seen."""
+        """Vector (2,) from mid-hips to mid-shoulders, px; NaN unless all four joints are seen."""
         places = dict(zip(self.names, np.where(self.seen[:, None], self.pixels, np.nan)))
         unknown = np.full(2, np.nan)
         middles = [
@@ -139,13 +139,13 @@ class Keypoints:
         )
 
     def named_for(self, body: Body, scheme: str = 'auto') -> tuple[Keypoints, list[str]]:
-        """Keypoints renamed after the joints of a body, and the names that the body lacks.
+        """Keypoints renamed to joints of a body, and the names for which the body has no joint.
 
         Unknown covariances are replaced by the learned noise of the scheme.
 
         Args:
             scheme: scheme of the names, see `keypoint_schemes`; 'auto' selects a scheme with all
-                names, 'joints' means that the names are joints of the body.
+                names; 'joints': the names are joints of the body.
 
         Raises:
             ValueError: there is no such scheme.
@@ -197,12 +197,12 @@ class Keypoints:
 
 
 class Points(NamedTuple):
-    """P keypoints, each with its own landmark and with that of the other side.
+    """P keypoints, each with its own landmark and the landmark of the other side.
 
     Attributes:
         segments: (P, 2) segments that carry the landmarks.
-        offsets: (P, 2, 3) of the landmarks in the frames of the segments, m.
-        pixels: (P, 2).
+        offsets: (P, 2, 3) positions of the landmarks in the frames of the segments, m.
+        pixels: (P, 2) detected positions, px.
         whiteners: (P, 2, 2) W, where W' W is the precision.
         groups: (P,) group with which each keypoint changes sides.
     """
@@ -219,14 +219,14 @@ class Lifted(NamedTuple):
 
     Attributes:
         segments: (J,) segments that carry the joints.
-        offsets: (J, 3) of the joints in the frames of the segments, m.
+        offsets: (J, 3) positions of the joints in the frames of the segments, m.
         middle: (3,) middle of the hips in the frame of the root, m.
         ray: (3,) line of sight, unit vector.
-        log_weights: (C,) including the normalisers of the components.
+        log_weights: (C,) log weights, including the normalisers of the components.
         depths: (2, C, J) means along the ray from the middle of the hips, m, with sides as named
-            and exchanged.
+            and with sides exchanged.
         precisions: (2, C, J) square roots of the precisions, 1/m.
-        readings: (E,) row of `depths`, 0 or 1, that applies in each exchange of sides.
+        readings: (E,) row of `depths` and `precisions`, 0 or 1, for each exchange of sides.
         weight: factor on the energy; 0 without a mixture.
         scale: scale of the kernel, in standard deviations; it bounds the energy of a joint.
     """
@@ -251,10 +251,11 @@ class KeypointInputs(NamedTuple):
         lifted: the mixture over whole poses.
         tree, lens: skeleton and camera.
         scale: scale of the kernel, in standard deviations.
-        weights: (G,) factors on the energies of the groups.
-        factors: (S,) factors on energies, by the segment of the keypoint as named; (0,) if all 1.
+        weights: (G,) factors on the energies of the groups of landmarks.
+        factors: (S,) factors on the energies of keypoints on each segment, with sides as named;
+            (0,) if all are 1.
         exchanged: (E, G) 1 where a group changes sides in an exchange.
-        log_priors: (R, E) log priors of the exchanges, one row per problem or one for all.
+        log_priors: (R, E) log priors of the exchanges, one row per problem or a single row.
     """
 
     points: Points
@@ -275,20 +276,20 @@ class KeypointTerm:
     Keypoints that were not seen (NaN) or have confidence 0 are ignored.
 
     Attributes:
-        skeleton, camera: the person, and the camera that sees the person.
+        skeleton, camera: skeleton of the person, and the camera.
         keypoints: the detected keypoints.
         settings: weight w, factor on the standard deviations, and scale of the kernel; an
             infinite scale gives least squares.
         magnification: px/m at the person; 0 if unknown.
-        exchanges: (R, E) log prior probability of each exchange, one row per problem or one for
-            all; None if sides are never exchanged.
+        exchanges: (R, E) log prior probability of each exchange, one row per problem or a single
+            row; None if sides are never exchanged.
         beliefs: (G,) factors on the energies of the groups of landmarks; None if all are 1.
         lifted_share: factor on the energy of the mixture over whole poses.
-        segments: (S,) factors on energies, by the segment of the keypoint as named; (0,) or None
-            if all are 1.
+        segments: (S,) factors on the energies of keypoints on each segment, with sides as named;
+            (0,) or None if all are 1.
 
     Raises:
-        KeyError: a keypoint is not at a joint of the body.
+        KeyError: the skeleton lacks the joint of a keypoint.
     """
 
     skeleton: Skeleton
@@ -303,7 +304,7 @@ class KeypointTerm:
 
     @cached_property
     def compiled(self) -> KeypointInputs:
-        """The term as compiled code reads it."""
+        """The term as input of the compiled core."""
         exchanges = np.zeros((1, 1)) if self.exchanges is None else self.exchanges
         lifted = self.measured.lifted
         return KeypointInputs(
@@ -319,7 +320,7 @@ class KeypointTerm:
         )
 
     def exchanged(self, frames: Frames, rows: Index) -> Array:
-        """Posterior log probabilities (N, E) of the exchanges at the frames of N poses."""
+        """Posterior log probabilities (N, E) of the exchanges at N poses, given as frames."""
         inputs = self.compiled
         priors = inputs.log_priors[rows if len(inputs.log_priors) > 1 else [0] * frames.count]
         result = np.empty(priors.shape)
@@ -327,25 +328,25 @@ class KeypointTerm:
         return result
 
     def residuals(self, frames: Frames) -> tuple[Index, Array, Array, Array, Array]:
-        """The residuals at the frames of one pose, in the likeliest exchange.
+        """The residuals at one pose, given as frames, in the likeliest exchange of sides.
 
         Returns:
             (M,) joint of the skeleton, (M, 3) position of the landmark, (M, 3) derivative of the
             residual with respect to the position, (M,) derivative and (M,) curvature of the energy
             with respect to the residual; two residuals per keypoint. Landmarks behind the camera
-            have none.
+            have no residuals.
         """
         (found,) = self.recorded(frames)
         rows = found[1 : 1 + int(found[0, 0])]
         return rows[:, 0].astype(np.intp), rows[:, 1:4], rows[:, 4:7], rows[:, 7], rows[:, 8]
 
     def recorded(self, frames: Frames) -> Array:
-        """The residuals at the frames of N poses; see `residuals` and `record_keypoints`.
+        """The residuals at N poses, given as frames; see `residuals` and `record_keypoints`.
 
         Returns:
-            (N, 1 + M, RECORDED): rows 1 to m of a pose are joint, position, derivative of the
-            residual with respect to it, derivative and curvature of the energy; m is the
-            first number of row 0.
+            (N, 1 + M, RECORDED): the first number of row 0 is m; rows 1 to m are joint, position,
+            derivative of the residual with respect to the position, derivative and curvature of the
+            energy.
         """
         measured = self.measured
         result = np.zeros((frames.count, 1 + 2 * len(measured.joints), RECORDED))
@@ -355,7 +356,7 @@ class KeypointTerm:
     def distances(self, frames: Frames) -> Array:
         """Distances (N, P) of the P seen keypoints from N poses, in standard deviations.
 
-        Sides are exchanged in the likeliest way; landmarks behind the camera have NaN.
+        The likeliest exchange of sides is used; NaN for landmarks behind the camera.
         """
         errors = np.empty((frames.count, len(self.measured.joints), 2))
         keypoint_errors(self.compiled, *frames.by_pose(), errors)
@@ -363,23 +364,23 @@ class KeypointTerm:
 
     @property
     def weights(self) -> Array:
-        """Factors (G,) on the energies of the groups."""
+        """Factors (G,) on the energies of the groups of landmarks."""
         beliefs = np.ones(EXCHANGED.shape[1]) if self.beliefs is None else self.beliefs
         return np.asarray(self.settings.weight * beliefs, dtype=np.float64)
 
     @property
     def measured(self) -> MeasuredKeypoints:
-        """The keypoints as inputs of the kernel, the same for all poses of the skeleton."""
+        """The keypoints as inputs of the kernel, for all poses of the skeleton."""
         sigma = self.settings.sigma
         return _measured(self.skeleton, self.keypoints, sigma, self.magnification)
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredKeypoints:
-    """P usable keypoints, as inputs of the kernel, the same for all poses of a skeleton.
+    """P usable keypoints as inputs of the kernel, for all poses of a skeleton.
 
     Attributes:
-        joints: (P, 2) joints that the keypoints show, with sides as named and exchanged.
+        joints: (P, 2) joint of each keypoint, with sides as named and with sides exchanged.
         points: pixels of the keypoints, and the segments on which they lie.
         lifted: the mixture over whole poses.
     """
@@ -389,8 +390,8 @@ class MeasuredKeypoints:
     lifted: Lifted
 
 
-# A track makes a term for every set of hypotheses of an image, and its start makes one for every
-# trial of bone lengths. Inputs that depend on neither of these are computed once.
+# A track makes a term for every set of hypotheses of an image, and the start of a track for every
+# trial of bone lengths. Inputs that depend on neither are computed once.
 @lru_cache(maxsize=16)
 def _measured(
     skeleton: Skeleton, keypoints: Keypoints, sigma: float, magnification: float
@@ -437,7 +438,7 @@ NOT_LIFTED = Lifted(
 
 @lru_cache(maxsize=16)
 def _lifted(skeleton: Skeleton, poses: LiftedPoses | None, sigma: float) -> Lifted:
-    """A mixture over whole poses as compiled code reads it."""
+    """A mixture over whole poses as input of the compiled core."""
     known = set(skeleton.joint_names)
     if poses is None or not known.issuperset(HIPS):
         return NOT_LIFTED

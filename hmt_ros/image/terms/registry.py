@@ -2,8 +2,8 @@
 
     E_image(x) = sum_t E_t(x)        over the terms t of the registry
 
-A new term needs a file in this folder and a line in `TERMS`, and in the core, which computes the
-terms pose by pose, a header in `core/terms` and a line in `core/terms.h`, in the same order.
+A new term needs a file in this folder and a line in `TERMS`. The core, which computes the terms
+pose by pose, needs a header in `core/terms` and a line in `core/terms.h`, in the same order.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ TERMS: tuple[ImageTerm, ...] = (COVERAGE, EDGES, DEPTH)
 
 
 class Model(NamedTuple):
-    """Body and camera as compiled code reads them.
+    """Body and camera as inputs of the compiled core.
 
     Attributes:
-        tree, flesh, lens: skeleton, parts and rings, camera.
+        tree, flesh, lens: skeleton; parts and rings of the flesh; camera.
         traced: (B,) parts whose contour is compared with the image.
-        occluders: (B,) parts that can hide others.
-        contour_points: number of contour points to which weights refer; 0: that of existing points.
+        occluders: (B,) parts that can hide other parts.
+        contour_points: number of contour points to which weights refer; 0: the number of existing
+            points.
     """
 
     tree: Tree

@@ -31,12 +31,12 @@ MIN_OUTLINE_LENGTH = 12
 
 
 class Outline(NamedTuple):
-    """M samples on the outline of a silhouette.
+    """M sample points on the outline of a silhouette.
 
     Attributes:
         pixels: (M, 2) positions of the samples.
-        normals: (M, 2) unit vectors out of the silhouette.
-        beliefs: (M,) belief in each sample, 0 to 1.
+        normals: (M, 2) unit normals that point out of the silhouette.
+        beliefs: (M,) probability that each sample belongs to the person's outline, 0 to 1.
     """
 
     pixels: Array
@@ -50,8 +50,8 @@ class CoverageInputs(NamedTuple):
     Attributes:
         term: weight and noise of the term.
         outline: samples on the outline.
-        explained: (X, M) maximum energy of each sample; one row per pose, or one for all.
-        costs: (N, M) output, energy of each sample; (0, M) if not wanted.
+        explained: (X, M) maximum energy of each sample; one row per pose, or a single row.
+        costs: (N, M) buffer for the energy of each sample, an output; (0, M): not computed.
     """
 
     term: Weighting

@@ -31,7 +31,7 @@ class Proposal(Protocol):
         ...
 
 
-# Proposals of every tracker, used before the one that the setting `proposals` selects. Each
+# Proposals that every tracker uses, before the proposal selected by the setting `proposals`. Each
 # proposal decides whether it applies to an image. To add a proposal, add a file in this folder and
 # a name here.
 USUAL_PROPOSALS: tuple[Proposal, ...] = (predicted_poses, reversed_poses)
@@ -59,5 +59,5 @@ def propose(
     sources: Hypotheses,
     rng: np.random.Generator,
 ) -> Hypotheses:
-    """Concatenates the hypotheses of proposals; see `Proposal` for the other arguments."""
+    """Concatenates the hypotheses from all proposals; see `Proposal` for the other arguments."""
     return joined([each(search, sources, rng) for each in proposals])

@@ -10,8 +10,9 @@ Covariance-scaled sampling of one limb at a time (KJS 3).
     E(a) = E_image(a) + E_keypoints(a) + E_prior(a) + E_motion(a)      over the angles a of a limb
 
 Given the trunk, limbs are nearly independent. Instead of all 37 degrees of freedom, the four to six
-of one limb are sampled and compared with the image near the limb, and the best samples are refined.
-The limb need not explain a part of the silhouette's outline that the rest of the body explains.
+degrees of freedom of one limb are sampled and compared with the image near the limb, and the best
+samples are refined. The limb need not explain a part of the silhouette's outline that the rest of
+the body explains.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def find_limb(
     plan: EvaluationPlan,
     rng: np.random.Generator,
 ) -> Array:
-    """Searches angles (A, chain dofs) of a limb that fit the image; they may repeat.
+    """Searches angles (A, chain dofs) of a limb that fit the image; results may repeat.
 
     Args:
         posterior: energies of poses of the body.
@@ -144,7 +145,7 @@ def jumped_poses(search: Search, sources: Hypotheses, rng: np.random.Generator) 
     poses, members, energies = (np.concatenate(parts) for parts in zip(*everything, strict=True))
     kept = search.best(poses, energies)
     poses, members = poses[kept], members[kept]
-    # The motion prior of a jumped variable is centred at its new value, otherwise at the
+    # The motion prior is centred at the new value of a jumped variable, otherwise at the
     # prediction.
     jumped = np.abs(poses - base.x[members]) > MIN_JUMP
     return sources.proposed(members, poses, jumped)
@@ -165,7 +166,7 @@ def _groups(search: Search) -> list[Index]:
 
 
 def limbs_not_shown(posterior: Posterior, observation: Observation, surprising: bool) -> list[str]:
-    """Names of the limbs to search in an image, because keypoints do not show them.
+    """Names of limbs to search in an image: limbs without keypoints, or all if it is surprising.
 
     Two keypoints determine a limb up to its flips; samples away from them mostly fit other limbs or
     the background. In a surprising image the keypoints may be wrong.

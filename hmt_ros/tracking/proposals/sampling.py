@@ -22,7 +22,7 @@ from hmt_ros.tracking.optimisation import Search
 def spherical_samples(
     body: Body, means: Array, covariances: Array, count: int, scale: float, rng: np.random.Generator
 ) -> Array:
-    """Samples (K, count, d) with isotropic noise of the volume of each covariance.
+    """Samples (K, count, d) with isotropic noise that has the volume of each covariance.
 
     The radius is the geometric mean of the axes of the ellipsoid, |S|^(1/2d). Samples are clipped
     to the limits.
@@ -70,7 +70,7 @@ def covariance_scaled_poses(
 
 
 def spherical_poses(search: Search, sources: Hypotheses, rng: np.random.Generator) -> Hypotheses:
-    """Spherical samples of the same volume around the predictions."""
+    """Spherical samples around the predictions, with the volume of the covariances."""
     return _sampled(spherical_samples, search, sources, rng)
 
 

@@ -14,7 +14,7 @@ the prediction.
 
 A reversal is the whole pose reversed in depth, with left and right exchanged (`body.mirror`). A
 silhouette hardly distinguishes a pose from its reversal, so a track may follow a turn in the wrong
-direction, and no jump of a limb corrects that. If one of the two facing directions has no mode of
+direction, which no jump of a limb corrects. If one of the two facing directions has no mode of
 comparable weight, the best mode is reversed.
 """
 
@@ -37,7 +37,7 @@ from hmt_ros.tracking.validity import UNDECIDED_MISFITS, ByKeypoints
 
 
 class PoseByKeypoints:
-    """Pose fitted to keypoints alone, followed while the modes miss a group of keypoints.
+    """Pose fitted to keypoints alone, updated while the modes miss a group of keypoints.
 
     Attributes:
         pose: (1, d) pose in the last image; None: the modes explain every group of keypoints.
@@ -76,7 +76,7 @@ class PoseByKeypoints:
 
 
 def predicted_poses(search: Search, sources: Hypotheses, _rng: np.random.Generator) -> Hypotheses:
-    """Proposes the means of a prediction, if any, as jumps from their nearest modes."""
+    """Proposes the mean poses of a prediction, each as a jump from its nearest mode."""
     if search.prediction is None:
         return sources[:0]
     poses = search.prediction.seen_as(search.posterior.person).means
@@ -86,12 +86,12 @@ def predicted_poses(search: Search, sources: Hypotheses, _rng: np.random.Generat
 
 
 def keypoint_poses(search: Search, sources: Hypotheses) -> Hypotheses:
-    """Proposes the heaviest mode, fitted to keypoints alone, if it misses too many keypoints.
+    """Proposes a pose fitted to keypoints alone if the heaviest mode misses too many of them.
 
-    The condition is that the optimum of the mode misses more than a quarter of the keypoints of a
-    group: the silhouette holds back limbs that have moved far since the previous image. The pose is
-    dropped if the person cannot have moved there: then the keypoints belong to another person, or
-    the track is lost.
+    The optimum of the mode must miss more than a quarter of the keypoints of a group, as happens if
+    the silhouette holds back limbs that have moved far since the previous image. The pose is
+    dropped if the person cannot have moved there, because then the keypoints belong to another
+    person, or the track is lost.
     """
     posterior, observation = search.posterior, search.observation
     if posterior.placing(observation) is None:

@@ -10,7 +10,7 @@ from hmt_ros.app.import_video.keypoint_files.persons import FoundPersons, person
 from msg_tools.files.array_file import read_archive
 from msg_tools.files.budget import Budget
 
-_MAX_BYTES = 2**28  # maximum size, bytes; an archive of an hour has 10**8
+_MAX_BYTES = 2**28  # maximum size, bytes; the keypoints of an hour take 10**8
 _RECORDS_PER_PERSON = 10  # cost of a person in the budget, records
 
 
@@ -18,7 +18,8 @@ def read_arrays(path: Path) -> FoundPersons:
     """Reads an archive; row t of each array is frame t.
 
     Raises:
-        ValueError: not an archive, no keypoints in it, or contradictory shapes of arrays.
+        ValueError: the file is not an archive, has no keypoints, or has arrays of inconsistent
+            shapes.
     """
     content = read_archive(path, _MAX_BYTES)
     budget = Budget(path.stat().st_size)

@@ -16,7 +16,7 @@ BY_SIZE, BY_DISTANCE, BY_INDEX, BY_ID = 'largest', 'nearest', 'index', 'id'
 BY_PLACE, BY_LENGTH = 'at', 'track'
 # Maximum motion of a person from frame to frame, in diagonals of their box.
 _MAX_MOTION = 0.5
-# Margin around the box of a person within which a point selects them, in diagonals of the box.
+# Margin around the box of a person in which a point selects the person, in diagonals of the box.
 _BOX_MARGIN = 0.15
 # Maximum number of frames without the person before a track ends.
 _MAX_ABSENCE = 30
@@ -27,16 +27,16 @@ _MAX_LISTED_NAMES = 8  # maximum number of names in an error message
 
 @dataclass(frozen=True)
 class Choice:
-    """The choice of the person to track among several.
+    """Criterion that selects one person to track among several.
 
     Attributes:
         kind: `BY_SIZE`: the largest box in each frame. `BY_DISTANCE`: the largest person in the
-            first frame, then the person nearest to the previous one. `BY_INDEX`: an index in the
+            first frame, then the person nearest to their last position. `BY_INDEX`: an index in the
             list of each frame. `BY_ID`: the name from the detector. `BY_PLACE`: the person at an
             image point at a time, then the nearest before and after. `BY_LENGTH`: a rank among the
             tracks of the clip, the longest first.
-        value: the index, rank or name.
-        point: column and row, px, and time since the first frame, s.
+        value: index, rank or name of the person, depending on `kind`.
+        point: for `BY_PLACE`, column and row, px, and time since the first frame, s.
     """
 
     kind: str = BY_DISTANCE
@@ -48,7 +48,7 @@ class Choice:
         """Parses a choice from the command line, such as largest or index:0.
 
         Raises:
-            ValueError: the text is not a choice.
+            ValueError: the text is not a valid choice.
         """
         kind, colon, value = text.partition(':')
         if kind in (BY_SIZE, BY_DISTANCE) and not colon:
@@ -74,14 +74,14 @@ class Choice:
 def chosen_person(
     found: FoundPersons, choice: Choice, first: int = 0, rate: float | None = None
 ) -> dict[int, Person]:
-    """The chosen person in the frames that show them, by key of the frame.
+    """The chosen person in each frame that shows the person, by frame key.
 
     Args:
         first: key of the first frame to search.
-        rate: frames per second; needed only for `BY_PLACE` with a time if frames are numbered.
+        rate: frames per second; required only if `BY_PLACE` has a time and frames are numbered.
 
     Raises:
-        ValueError: no person matches the choice; the text lists alternatives.
+        ValueError: no person matches the choice; the message lists alternatives.
     """
     kind, value = choice.kind, choice.value
     if kind == BY_INDEX:
@@ -133,7 +133,7 @@ def _largest(persons: Sequence[Person]) -> Person:
 
 
 def _called(found: FoundPersons, name: str) -> dict[int, Person]:
-    """The person with a name, in the frames that show them."""
+    """The person with a given name, in each frame that shows the person."""
     likely = found.likely()
     there = {key: x for key, persons in likely.items() for x in persons if x.track == name}
     if not there:
@@ -152,7 +152,7 @@ def _names_in(found: FoundPersons) -> str:
 
 
 def _person_at(persons: Sequence[Person], column: float, row: float) -> Person:
-    """The person at or nearest to a point of the image; raises ValueError if none is near."""
+    """The person at or nearest to a point of the image; raises ValueError if nobody is near."""
     point = np.array([column, row])
     low, high = (np.array([x.box[i] for x in persons]) for i in range(2))
     middles = (low + high) / 2
@@ -174,7 +174,7 @@ def tracks_of(likely: Mapping[int, list[Person]], unit: float = 1.0) -> list[dic
         unit: difference between the keys of consecutive frames.
 
     Raises:
-        ValueError: too many persons at once to follow each.
+        ValueError: too many persons at the same time.
     """
     tracks: list[dict[int, Person]] = []
     going: list[tuple[int, Person, dict[int, Person]]] = []
@@ -209,7 +209,7 @@ def tracks_of(likely: Mapping[int, list[Person]], unit: float = 1.0) -> list[dic
 def _followed(
     frames: Iterable[tuple[int, list[Person]]], person: Person, unit: float
 ) -> Iterator[tuple[int, Person]]:
-    """Follows a person: yields the nearest person in each frame, unless it is out of reach."""
+    """Follows a person: yields the nearest person in each frame, if within reach."""
     before: int | None = None
     for key, persons in frames:
         if before is not None:

@@ -1,9 +1,10 @@
-"""Checks a whole clip before its keypoints are used.
+"""Checks the keypoints of a whole clip before they are used.
 
-Files of detectors do not define the meaning of their numbers: percent or fractions, points in
-smaller images, lists in one of several orders. In the right interpretation the clip shows people:
-confidences up to 1, points all over the image, bones of human lengths. An interpretation that fits
-is reported to the user; if none fits, the error names the option that helps.
+Detector files do not say what their numbers mean: confidences can be percent or fractions,
+positions can be from smaller images, and lists of points have one of several orders. In the right
+interpretation the clip shows people: confidences up to 1, points all over the image, bones of human
+lengths. An interpretation that fits is reported to the user; if none fits, the error names the
+option that helps.
 
 Bones: with d the length of bone b in an image, L its usual human length and s = sum d / sum L, the
 90 % quantile q of d / (s L) over the images is near c = 1.18, because a bone that is oblique to the
@@ -41,10 +42,10 @@ from hmt_ros.inference.arrays import Array, Mask
 
 # Upper ends of the confidence scales of detectors.
 _SCALES = (100.0, 255.0, 1000.0)
-# Maximum median of confidences on the scale from 0 to 1.
+# Maximum of the median confidence on the scale from 0 to 1.
 _FRACTIONS = 1.5
 _MIN_SCALE = 10.0
-# Maximum coordinate of positions that are fractions of the image.
+# Maximum coordinate for which positions are taken to be fractions of the image.
 _FRACTION = 2.0
 # Minimum fraction of confident points in or near the image, minimum confidence of these points, and
 # margin around the image, in image sizes. Detectors are not confident of points that they guess.
@@ -57,12 +58,12 @@ _MIN_POINTS = 100  # minimum number of points for a conclusion about all points
 _MIN_BONE_CONFIDENCE, _MIN_BONES = 0.3, 6
 _MIN_PERSONS, _MAX_PERSONS = 10, 2000  # minimum and maximum number of persons that are checked
 _QUANTILE, _USUAL, _BELOW = 0.9, 1.18, 1.67
-# Maximum z of an accepted order of points, ratio of z below which another order replaces the usual
-# order, and maximum z of given names.
+# Maximum z for an accepted order of points; ratio of z below which a different order replaces the
+# usual order; maximum z for points with names.
 _MAX_Z, _MAX_Z_RATIO, _MAX_Z_OF_NAMES = 2.75, 0.6, 3.5
 # A leap: minimum mean motion of the points, in diagonals of the box; maximum distance after the
-# return, as a fraction of the leap; maximum number of frames until the return. An error: minimum
-# number of leaps, and their minimum fraction of all steps.
+# return, as a fraction of the leap; maximum number of frames until the return. Limits for an error:
+# minimum number of leaps, and minimum ratio of leaps to steps.
 _LEAP, _BACK, _SOON, _LEAPS, _OFTEN = 0.2, 0.4, 10, 3, 0.1
 
 
@@ -82,7 +83,8 @@ def check_clip(
         points_size: size of the images in which the points were found, px; None if unknown.
 
     Raises:
-        ValueError: no interpretation fits (the text names the option to use), or an unknown scheme.
+        ValueError: no interpretation fits (the message names the option to use), or the scheme is
+            unknown.
     """
     scheme_of((), scheme)
     if not any(found.persons()):
@@ -152,7 +154,7 @@ def _scale_places(
 
 
 def _check_places(points: Array, sure: Mask, size: tuple[int, int]) -> None:
-    """Raises ValueError if points (n, 2) seem to be from images of another size."""
+    """Raises ValueError if points (n, 2) seem to be from images of a different size."""
     (width, height), shares = size, points / size
     outside = ((shares < -_IMAGE_MARGIN) | (shares > 1 + _IMAGE_MARGIN)).any(1) & sure
     if outside.sum() > (1 - _MIN_INSIDE_FRACTION) * sure.sum():

@@ -1,4 +1,4 @@
-"""Folders with a file for each frame: JSON of OpenPose and others, labels of Ultralytics."""
+"""Reads folders with one file per frame: JSON, for example of OpenPose, or Ultralytics labels."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def read_folder(path: Path, source: FrameSource) -> FoundPersons:
 
 
 def _add_labels(found: FoundPersons, file: Path, number: int) -> None:
-    """Adds the lines of Ultralytics: class, box, keypoints as fractions, confidence, track."""
+    """Adds persons from lines of class, box, keypoints as fractions, confidence, and track."""
     text = read_bytes(file, MAX_LABELS_BYTES).decode('utf-8', 'replace')
     for i, line in enumerate(text.split('\n')):
         try:

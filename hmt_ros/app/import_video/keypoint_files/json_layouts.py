@@ -1,6 +1,6 @@
-"""JSON of detectors: COCO, MMPose, AlphaPose, OpenPose, Ultralytics.
+"""Reads JSON of detectors: COCO, MMPose, AlphaPose, OpenPose, Ultralytics.
 
-Their layouts differ in the nesting of frames and persons, and in the names of fields.
+The layouts differ in the nesting of frames and persons, and in the names of fields.
 """
 
 from __future__ import annotations
@@ -71,14 +71,14 @@ def add_json(found: FoundPersons, content: Any, source: FrameSource) -> None:
 
 
 def _get(entry: Any, names: Sequence[str], default: Any = None) -> Any:
-    """Value of the first given name that an object has, or else the default."""
+    """Value of the first of the given names that an object has, or else the default."""
     if not isinstance(entry, dict):
         return default
     return next((entry[x] for x in names if entry.get(x) is not None), default)
 
 
 def _annotations(found: FoundPersons, content: dict[str, Any]) -> tuple[Any, list[Labelled]]:
-    """Names and frames of COCO annotations."""
+    """Keypoint names and frames in COCO annotations."""
     labels: dict[str, str | int] = {}
     for image in _list(content, 'images'):
         name = image.get('file_name') or image.get('id')
@@ -123,7 +123,7 @@ def frames_in(content: Any, label: Any) -> Iterator[Labelled]:
 
 
 def _frames_of_object(content: dict[str, Any], label: Any) -> Iterator[Labelled]:
-    """Yields the frames in an object: one frame, frames by name, or frames of each person."""
+    """Yields the frames in an object: a single frame, frames by name, or frames for each person."""
     persons = _get(content, _PERSON_FIELDS)
     if 'instance_info' in content:
         yield from frames_in(content['instance_info'], 0)

@@ -35,7 +35,7 @@ class Person:
     Attributes:
         keypoints: keypoints under the detector's names, with unknown covariances (NaN).
         track: identity of the person over all frames; '' if the detector does not track.
-        score: confidence of the detector in the person, on any scale.
+        score: the detector's confidence that this is a person, on any scale.
     """
 
     keypoints: Keypoints
@@ -54,7 +54,7 @@ class Person:
         return float(np.linalg.norm(self.box[1] - self.box[0]))
 
     def distance(self, other: Person) -> float:
-        """Mean distance of common keypoints, px, or else the distance of the box centres."""
+        """Distance to another person, px: mean over common keypoints, or else of box centres."""
         names, theirs = self.keypoints.names, other.keypoints
         pixels, seen = theirs.pixels, theirs.seen
         if names != theirs.names:  # rows of a table may have different keypoints
@@ -84,10 +84,10 @@ def person(
         names: names of the keypoints; None selects the usual order of n points.
         pixels: (n, 2) image positions, px.
         confidences: (n,) confidences on any scale; None sets all to 1.
-        positions: (n, 3) 3D positions, m; None if the detector gives none.
+        positions: (n, 3) 3D positions, m; None without 3D positions.
 
     Raises:
-        ValueError: no order of n points is known.
+        ValueError: no order is known for lists of n points.
     """
     places = np.array(pixels, dtype=np.float64)
     sure = np.ones(len(places)) if confidences is None else np.array(confidences, dtype=np.float64)
@@ -108,7 +108,7 @@ def orders_of(count: int) -> tuple[str, ...]:
     """Possible schemes of a list of `count` unnamed points, the usual scheme first.
 
     Raises:
-        ValueError: no scheme is known.
+        ValueError: no scheme has this number of points.
     """
     known = unnamed_orders()
     if count in known:
@@ -131,7 +131,7 @@ def image_size_of(width: Any, height: Any) -> tuple[int, int] | None:
 
 
 def landmark_name(name: str) -> str:
-    """The landmark of a marker, such as right_big_toe for RBigToe; an unknown name is unchanged."""
+    """Landmark name for a marker name, right_big_toe for RBigToe; unknown names stay unchanged."""
     text = name.lower() if name.isupper() else name
     words = [x.lower() for x in re.findall(r'[A-Z]?[a-z]+|[A-Z](?![a-z])|\d+', text)]
     if words and words[-1] in _SIDES and words[0] not in _SIDES:
@@ -152,9 +152,9 @@ class FoundPersons:
         path: file or folder of the detector, for error messages.
         frames: persons by number of the frame, or by time since the first frame, ns.
         timed: whether the keys of `frames` are times.
-        rows: number of frames of a file with an entry for every frame; None for other files.
+        rows: number of frames, if the file has an entry for every frame; None otherwise.
         size: width and height of the images that the detector used, px; None if unknown.
-        unnamed: number of points in lists without names; 0 if points have names.
+        unnamed: number of points per person if they have no names; 0 if they have names.
         fractions: whether positions are fractions of the image, not px.
     """
 
@@ -221,7 +221,8 @@ def numbers_of(labels: Sequence[str | int], source: FrameSource, *, from_one: bo
     """Frame numbers, from 0, of the given labels.
 
     Args:
-        from_one: whether the detector counts from 1; ignored if the source defines the numbers.
+        from_one: whether the detector numbers frames from 1; ignored if the source defines the
+            numbers.
 
     Raises:
         ValueError: a label refers to no frame.

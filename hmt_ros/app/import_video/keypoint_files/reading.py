@@ -50,7 +50,8 @@ def read_keypoints(path: Path, source: FrameSource, first_stamp_ns: int) -> Foun
         first_stamp_ns: stamp of the first frame, which is subtracted from stamps in the file.
 
     Raises:
-        ValueError: the file is missing, unreadable, of unknown format, or contradictory.
+        ValueError: the file is missing or unreadable, or has an unknown format or inconsistent
+            content.
     """
     kind = path.suffix.lower()
     try:
@@ -98,7 +99,7 @@ def keypoints_of_person(
         rate: frames per second; None if unknown.
 
     Raises:
-        ValueError: the clip is contradictory, or has no such person; the text names a remedy.
+        ValueError: the clip is inconsistent, or has no such person; the message names a remedy.
     """
     notices: list[str] = []
     check_clip(found, size, notices.append, scheme=reading.scheme, points_size=reading.points_size)

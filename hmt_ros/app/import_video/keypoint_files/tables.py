@@ -23,9 +23,9 @@ from msg_tools.messages.headers import SECOND_NS
 MAX_FILE_BYTES = 2**26  # maximum size, bytes
 _CELL_BYTES = 64  # memory of a cell, bytes
 FRAME_COLUMN, TIME_COLUMN, STAMP_COLUMN = 'frame', 'time_s', 'stamp_ns'
-# Minimum of Unix times, and maximum of times that are in seconds.
+# Minimum time that is a Unix time, and maximum time that is in seconds, not a shorter unit.
 _MIN_UNIX_TIME, _MAX_TIME = 1e8, 1e11  # s
-# Maximum coordinate of positions that are in metres, as from a calibrated system.
+# Maximum coordinate for which positions are taken to be in metres, from a calibrated system.
 _MAX_METRES = 20.0
 
 # A cell: line number, frame or time, person, keypoint, and texts of column, row and confidence.
@@ -39,7 +39,7 @@ def read_table(path: Path, source: FrameSource, first_stamp_ns: int) -> FoundPer
         first_stamp_ns: stamp of the first frame, which is subtracted from stamps in the file.
 
     Raises:
-        ValueError: the file is not a known table, or is contradictory.
+        ValueError: the file is not a known table, or is inconsistent.
     """
     try:
         text = read_bytes(path, MAX_FILE_BYTES).decode('utf-8-sig')
@@ -47,7 +47,7 @@ def read_table(path: Path, source: FrameSource, first_stamp_ns: int) -> FoundPer
         raise ValueError('not a table: the file is not text in UTF-8') from error
     markers, budget = path.suffix.lower() == '.trc', Budget(len(text))
     separator = '\t' if markers else ','
-    # Memory in Python of the text, of each cell with its entry in a list, and of each line.
+    # Memory in Python: of the text, of each cell including its list entry, and of each line.
     needed = 2 * len(text) + _CELL_BYTES * (text.count(separator) + 2 * text.count('\n'))
     if needed > MAX_MEMORY_BYTES:
         raise ValueError(
@@ -193,7 +193,7 @@ def _keys(labels: Sequence[str], when: str, source: FrameSource, first_stamp_ns:
 
 
 def _number(text: str, line: int) -> float:
-    """The number in a cell; NaN if it is empty."""
+    """The number in a cell; NaN for an empty cell."""
     try:
         return float(text) if text else math.nan
     except ValueError as error:
