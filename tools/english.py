@@ -27,6 +27,11 @@ PHRASES = {
     r'\btakes? in an? (?:image|message)\b': '"uses", "updates from"',
     r'\bis told (?:by|again)\b': '"is given by", "is reported again"',
     r'\bcomes? of (?:a|the)\b': '"follows from", "results from"',
+    r'\bthere are none\b': '"none", "... if missing"',
+    r'\bof which nothing\b': 'a sentence of its own',
+    r'\bthose who\b': '"people who", "the people that"',
+    r'\bhowever many\b': '"for any number of"',
+    r'\btexts of errors\b': '"error messages"',
 }
 # Path and phrase, and why the phrase is right there.
 ALLOWED = {

@@ -96,12 +96,18 @@ class Observer:
 
         Raises:
             ValueError: an array does not have the size of the camera's images, the timestamp does
-                not increase, or the body of the prediction has other degrees of freedom.
+                not increase, the keypoints have names of a detector, or the body of the prediction
+                has other degrees of freedom.
         """
         if given.prediction is not None:
             given.prediction.seen_as(body)
         if last is not None and given.stamp <= last:
             raise ValueError(f'stamps must increase, saw {given.stamp} after {last} ns')
+        names = () if given.keypoints is None else given.keypoints.names
+        if strange := [name for name in names if name not in body.joint_names]:
+            raise ValueError(
+                f"the body has no joints {strange}; use Keypoints.named_for for a detector's names"
+            )
         size = (self._camera.height, self._camera.width)
         for name, each in (
             ('', given.image),

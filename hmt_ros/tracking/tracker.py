@@ -196,7 +196,8 @@ class Tracker:
 
         Raises:
             ValueError: an image, mask or depth does not have the camera's size, the timestamp does
-                not increase, or the body of the prediction has other degrees of freedom.
+                not increase, the keypoints have names of a detector (see `Keypoints.named_for`), or
+                the body of the prediction has other degrees of freedom.
         """
         predicted = False if nobody_predicted else True if prediction is not None else None
         given = View(image, stamp, keypoints, prediction, mask, predicted, others, depth)

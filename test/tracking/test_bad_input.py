@@ -335,3 +335,13 @@ def test_stamps_that_do_not_increase_are_refused_and_change_nothing(
         for pairs in found
     )
     assert one == other
+
+
+def test_names_of_a_detector_are_refused_before_anything_changes(human32, camera):
+    tracker = Tracker(human32, camera, SETTINGS)
+    image = np.zeros((camera.height, camera.width, 3), np.uint8)
+    pixels = np.full((2, 2), 50.0)
+    found = Keypoints(('nose', 'left_wrist'), pixels, np.stack([np.eye(2)] * 2), np.ones(2))
+    with pytest.raises(ValueError, match=r"no joints \['nose'\]; use Keypoints.named_for"):
+        tracker.step(image, 0, found)
+    tracker.step(image, 0, found.named_for(human32)[0])
