@@ -117,7 +117,7 @@ class ClipTrajectories:
     def prior(self, count: int) -> TrajectoryPrior:
         """Prior of the states of the first images, as in the refinement."""
         of = self.origins[self.refined]
-        noise = self.found.liveliness[of].max()
+        noise = self.found.noise_factor[of].max()
         return self.smoother.dynamics.prior(np.diff(self.seconds[:count]), noise=noise)
 
     def spectrum(self, count: int) -> Array:
