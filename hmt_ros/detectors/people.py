@@ -3,8 +3,7 @@
 - The person network reliably finds people who fill 0.4 to 0.8 of its input. It searches the whole
   image and overlapping tiles; the smallest tiles suit people `MIN_HEIGHT` px high. The first image
   is searched completely, later images a few tiles at a time, so that each tile is searched once in
-  `SEARCH_TIME` s, or in `COUNTING_TIME` s while as many people are visible as may be followed. The
-  expected place of a lost person is searched, too. Known people are ignored.
+  `SEARCH_TIME` s. The expected place of a lost person is searched, too. Known people are ignored.
 - The landmark network sees a square around each person: the square of the last image, shifted by
   the person's velocity.
 - If two squares show the same body, the detection of better quality is kept.
@@ -35,10 +34,9 @@ from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.inference.error_model import seconds
 
 MAX_PEOPLE = 4  # maximum number of people
-# Time for one search of all tiles, and the same while everybody who may be followed is visible, so
-# that others only have to be counted; interval between searches for a lost person, and time after
+# Time for one search of all tiles, interval between searches for a lost person, and time after
 # which a lost person is forgotten, s.
-SEARCH_TIME, COUNTING_TIME, LOOK_INTERVAL, KEPT_TIME = 1.0, 5.0, 0.1, 3.0
+SEARCH_TIME, LOOK_INTERVAL, KEPT_TIME = 1.0, 0.1, 3.0
 # Gap after which smoothing restarts, s; time after which a doubtful person is confirmed, s; minimum
 # quality of a person who is confirmed at once.
 LOST_TIME, CONFIRMATION_TIME, EVIDENT_QUALITY = 0.5, 0.3, 0.75
@@ -223,9 +221,7 @@ class PeopleDetector:
         found = [x for x in sighted if x is not None]
         lost = [x for x in self._people if x not in known]
         lost += [x for x, one in zip(known, sighted, strict=True) if one is None]
-        time = SEARCH_TIME if len(found) < self._most else COUNTING_TIME
-        tiles = self._tiles_due(seconds(interval) / time)
-        found += self._searched(image, found, tiles + _places(lost, stamp_ns))
+        found += self._searched(image, found, self._tiles_due(interval) + _places(lost, stamp_ns))
         self._assign(image, _single(found), stamp_ns)
         self._people = [
             x for x in self._people if seconds(stamp_ns - x.seen) <= (KEPT_TIME if x.sure else 0.0)
@@ -266,10 +262,10 @@ class PeopleDetector:
         clothes = Clothes.of(image, keypoints)
         return _Sighted(found, keypoints, Sighting.of(seen, corners), clothes)
 
-    def _tiles_due(self, share: float) -> list[Square]:
-        """Tiles to search in an image, given the share of all tiles that has become due."""
+    def _tiles_due(self, interval: int) -> list[Square]:
+        """Tiles to search in an image, `interval` ns after the previous image."""
         tiles = _tiles(*self._size[::-1])
-        due = self._due_tiles + len(tiles) * share
+        due = self._due_tiles + len(tiles) * seconds(interval) / SEARCH_TIME
         count = int(min(due, len(tiles)))
         result = [tiles[(self._next_tile + i) % len(tiles)] for i in range(count)]
         self._next_tile, self._due_tiles = self._next_tile + count, min(due - count, 1.0)

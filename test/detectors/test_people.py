@@ -137,22 +137,6 @@ def test_people_who_stand_keep_their_names(rate):
     assert all(len(kept(names, x)) == 1 for x in people)
 
 
-def test_while_everybody_is_visible_others_are_searched_for_more_rarely():
-    searches = {}
-    for most in (2, 3):
-        scene = Scene([Person(RED, standing(150)), Person(GREEN, standing(450))], noise=1.0)
-        tiles = []
-        scene.circles = lambda image, square, scene=scene, tiles=tiles: (
-            tiles.append(square) or Scene.circles(scene, image, square)
-        )
-        names = names_over(scene, seconds=5.0, most=most)
-        assert all(len(x) == 2 for x in names[1:])
-        searches[most] = len(tiles)
-    # The first image is searched as a whole.
-    whole = searches[3] / 6
-    assert searches[2] == pytest.approx(2 * whole, abs=2)
-
-
 @pytest.mark.parametrize('rate', [30.0, 8.0])
 @pytest.mark.parametrize('colours', [(RED, GREEN), (RED, RED)])
 def test_two_who_cross(rate, colours):
