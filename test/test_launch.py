@@ -35,8 +35,10 @@ FILE = ROOT / 'launch' / 'hmt.launch.py'
 CAMERA_FILE = ROOT / 'launch' / 'camera.launch.py'
 REACH = ROOT / 'bags' / 'reach'
 NAMESPACE = '/humans/bodies/p1'
-# The likelihood may have to be compiled first.
+# Time limit for each answer and state of a node, on a loaded machine.
 PATIENCE = 180.0  # s
+# Time without an answer after which a service is called again, s.
+ASK_AGAIN = 5.0
 # Services and topics of every lifecycle node in rclpy.
 OF_ALL_NODES = (
     r'/(get_type_description|describe_parameters|get_parameter_types|get_parameters|'
@@ -506,10 +508,17 @@ class Running:
     def call(self, kind, name, service, **fields):
         client = self.node.create_client(kind, f'{NAMESPACE}/{name}/{service}')
         self.spin_until(client.service_is_ready, f'{service} of {name}')
-        future = client.call_async(kind.Request(**fields))
-        self.spin_until(future.done, f'an answer of {service} of {name}')
+        # The middleware drops an answer to a client that the node has not discovered yet.
+        asked = {}
+
+        def is_answered():
+            if not asked or time.monotonic() - max(asked) > ASK_AGAIN:
+                asked[time.monotonic()] = client.call_async(kind.Request(**fields))
+            return any(future.done() for future in asked.values())
+
+        self.spin_until(is_answered, f'an answer of {service} of {name}')
         self.node.destroy_client(client)
-        return future.result()
+        return next(future for future in asked.values() if future.done()).result()
 
     def wait_until_active(self, name):
         from lifecycle_msgs.srv import GetState
