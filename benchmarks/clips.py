@@ -127,7 +127,7 @@ def find_clips(
         quick: whether one short clip of this repository is enough if no folder is given.
 
     Raises:
-        ValueError: there is no clip.
+        ValueError: no clip was found.
     """
     if folder is not None:
         return _clips_in(folder, moving), str(folder)

@@ -1,4 +1,4 @@
-"""people: two people cross, one in front of the other; does each keep the own track?
+"""people: two people cross, one in front of the other; does each keep its own track?
 
 For every seed a bag is rendered (`make-bag crossing`: 320x240, 3 s at 10 Hz, COCO keypoints of both
 without identities, none for hidden joints) and replayed (`replay --people`). In the first second a

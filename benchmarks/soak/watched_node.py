@@ -150,7 +150,7 @@ class Watched:
         """The answer to a message.
 
         Raises:
-            Silent: there is no answer in time.
+            Silent: no answer arrived in time.
         """
         end = time.monotonic() + seconds
         while not self.node.has_answered:

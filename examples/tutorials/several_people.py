@@ -24,6 +24,7 @@ from hmt_ros.app.command_line import run_command
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
 from hmt_ros.app.truth import read_truth
+from hmt_ros.sessions.track import person_of
 from msg_tools import BagReader
 from msg_tools.messages.pose_mixtures import PoseMixture, pose_mixture_of
 
@@ -109,8 +110,8 @@ def tracks(bag: Path) -> dict[str, dict[int, PoseMixture]]:
         for stored in read.messages(topics):
             content = pose_mixture_of(stored.message)
             if len(content.weights):
-                # /humans/bodies/p1/pose_mixture
-                found.setdefault(stored.topic.split('/')[3], {})[content.stamp_ns] = content
+                person = person_of(stored.topic.removeprefix('/'))
+                found.setdefault(person, {})[content.stamp_ns] = content
     return found
 
 

@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[2]
 LIVING_ROOM = ROOT / 'bags' / 'living_room'
 # Two answers in colours that colour-blind people can distinguish; the truth is wide and grey.
 BLUE, RED, GREY = '#0072b2', '#d55e00', '#c8c8c8'
-LEAST = 0.01  # weight of an answer that is shown
+MIN_WEIGHT = 0.01  # minimum weight of an answer that is shown
 mpl.rcParams.update({'font.size': 11.0, 'axes.titlesize': 12.0, 'legend.frameon': False})
 
 
@@ -102,7 +102,7 @@ def answers_of(weights: Any, joints: Any, names: Sequence[str], arm: str = 'righ
     answers = []
     for what, which, colour in (('in front', ~behind, BLUE), ('behind', behind, RED)):
         share = float(weights[which].sum())
-        if share >= LEAST:
+        if share >= MIN_WEIGHT:
             answers.append(
                 (share, f'{100 * share:.0f} %: the arm is {what}', joints[which][0], colour)
             )

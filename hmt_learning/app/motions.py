@@ -140,7 +140,8 @@ def chosen_motions(motions: list[Path], without: list[str]) -> list[Path]:
     """Motion files given directly or in folders, except some names without suffix (cmu_02_*).
 
     Raises:
-        ValueError: a file is no motion, a folder has none, or an exception matches no file.
+        ValueError: a file has no motion, a folder has no motion file, or an exception matches no
+            file.
     """
     found: list[Path] = []
     for path in motions:

@@ -40,8 +40,8 @@ IN if it has one. Their names are absolute, /pose_mixture or, with --namespace /
 /humans/bodies/anna/pose_mixture. OUT is written completely or not at all.
 
 Several bags, or a folder with bags at any depth, go into the folder OUT, each under its own name,
-with <name>.replay.json beside it, which records its input and parameters. A bag that exists and was
-made from the same input with the same parameters is skipped; an unfinished one is replayed again.
+with <name>.replay.json beside it, which records its input and parameters. Existing bags of the same
+input and parameters are skipped; unfinished bags are replayed again.
 {bag} in --subject, --background, --bme and --body stands for the folder of each bag. With
 --scheduler Dask (the Python package distributed) replays the bags; its workers must see the files
 under the same names; the new bags are the same, byte for byte.
